@@ -1,0 +1,1 @@
+"""Mathematics: pure JAX functions of one branch and one frame, no files."""

@@ -1,0 +1,197 @@
+"""The door between robot and judge: one folder, written once, sealed, read only if unbroken."""
+
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from taojax.errors import InputError
+from taojax.specs import load_spec, read_bytes, read_npz, read_table, table_text, write_atomically
+
+SCHEMA = 1
+SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
+"""Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
+
+
+class Run(NamedTuple):
+    """A sealed run, verified. All the judge may hear of the robot."""
+
+    signals: dict[str, np.ndarray]
+    """Column -> (T,) as in data_specs/signals.toml; numbers float64, status str."""
+
+    map_poses: dict[str, np.ndarray]
+    """Column -> (M,) as in data_specs/map_poses.toml."""
+
+    index: np.ndarray
+    """(T, 100) retrieved map rows, best first, -1 = no candidate."""
+
+    similarity: np.ndarray
+    """(T, 100) their similarities."""
+
+    config_toml: str
+    """The resolved settings."""
+
+    manifest: dict[str, Any]
+    """What was run, on what, with which code."""
+
+
+def signal_names() -> tuple[str, ...]:
+    """Return the columns of signals.csv that are signals, in file order."""
+    columns = load_spec("signals")["columns"]
+    return tuple(column["name"] for column in columns if column.get("signal"))
+
+
+def digest(data: bytes) -> str:
+    """Return the SHA-256 of some bytes, hex."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file, hex, without holding it in memory.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
+
+
+def _seal(manifest: Mapping[str, Any]) -> str:
+    body = {key: value for key, value in manifest.items() if key != "seal"}
+    return digest(json.dumps(body, sort_keys=True).encode())
+
+
+def refuse_if_taken(out: Path) -> None:
+    """Check that a run may be written to `out`.
+
+    Raises:
+        InputError: `out` is a file or already holds something.
+    """
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+        raise InputError(f"{out}: already holds files; choose a new --out")
+
+
+def publish(out: Path, files: Mapping[str, bytes]) -> None:
+    """Write a whole folder at once: temporary name, fsync, rename.
+
+    Args:
+        out: the folder to make; must be absent or empty.
+        files: relative name -> bytes.
+
+    Raises:
+        InputError: `out` is taken (also by a process that was quicker), or cannot be written.
+    """
+    refuse_if_taken(out)
+    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        for name, raw in files.items():
+            write_atomically(part / name, raw)
+        # Renaming onto an empty folder is allowed, onto a filled one it fails: one writer wins.
+        part.rename(out)
+        folder = os.open(out.parent, os.O_RDONLY)
+        os.fsync(folder)
+        os.close(folder)
+    except OSError as error:
+        refuse_if_taken(out)
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def write_run(  # noqa: PLR0913 - one argument per sealed thing
+    out: Path,
+    *,
+    signals: Mapping[str, np.ndarray],
+    map_poses: Mapping[str, np.ndarray],
+    index: np.ndarray,
+    similarity: np.ndarray,
+    config_toml: str,
+    manifest: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Seal one run.
+
+    Args:
+        out: folder to make; must be absent or empty.
+        signals: column -> (T,); every column of data_specs/signals.toml.
+        map_poses: column -> (M,).
+        index: (T, 100) integers, -1 = no candidate.
+        similarity: (T, 100).
+        config_toml: resolved settings.
+        manifest: facts about the run; `sha256` may already hold hashes of the inputs.
+
+    Returns:
+        The manifest as sealed.
+
+    Raises:
+        InputError: `out` is taken or unwritable, or a signal is not finite.
+    """
+    archive = io.BytesIO()
+    np.savez_compressed(
+        archive, index=index.astype(np.int32), similarity=similarity.astype(np.float32)
+    )
+    files = {
+        "config.toml": config_toml.encode(),
+        "map_poses.csv": table_text("map_poses", map_poses).encode(),
+        "retrievals.npz": archive.getvalue(),
+        "signals.csv": table_text("signals", signals).encode(),
+    }
+    hashes = dict(manifest.get("sha256", {})) | {name: digest(raw) for name, raw in files.items()}
+    sealed = {"schema": SCHEMA, **manifest, "sha256": hashes}
+    sealed["seal"] = _seal(sealed)
+    files["manifest.json"] = (json.dumps(sealed, indent=2, sort_keys=True) + "\n").encode()
+    publish(out, files)
+    return sealed
+
+
+def read_manifest(run: Path) -> dict[str, Any]:
+    """Return a run's manifest after checking its own seal.
+
+    Raises:
+        InputError: missing, not JSON, of another schema, or edited since.
+    """
+    path = run / "manifest.json"
+    fix = "score the data set again"
+    try:
+        manifest = json.loads(read_bytes(path))
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON; {fix}") from error
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("sha256"), dict):
+        raise InputError(f"{path}: is not the manifest of a run; {fix}")
+    if manifest.get("schema") != SCHEMA:
+        raise InputError(f"{path}: schema {manifest.get('schema')!r} is not {SCHEMA}; {fix}")
+    if manifest.get("seal") != _seal(manifest):
+        raise InputError(f"{path}: seal broken, the manifest was edited; {fix}")
+    return manifest
+
+
+def read_run(run: Path) -> Run:
+    """Read a sealed run, or refuse if a byte has changed since.
+
+    Raises:
+        InputError: a sealed file is missing, changed or malformed.
+    """
+    manifest = read_manifest(run)
+    for name in SEALED:
+        want, got = manifest["sha256"].get(name), digest_file(run / name)
+        if got != want:
+            what = f"seal broken: sha256 {got[:12]}... is not {str(want)[:12]}..."
+            raise InputError(f"{run / name}: {what}; score the data set again")
+    arrays = read_npz(run / "retrievals.npz", "retrievals")
+    return Run(
+        signals=read_table(run / "signals.csv", "signals"),
+        map_poses=read_table(run / "map_poses.csv", "map_poses"),
+        index=arrays["index"],
+        similarity=arrays["similarity"],
+        config_toml=(run / "config.toml").read_text(encoding="utf-8"),
+        manifest=manifest,
+    )

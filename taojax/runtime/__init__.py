@@ -1,0 +1,1 @@
+"""What a robot could run: sensor files in, one sealed table of signals out."""

@@ -1,0 +1,146 @@
+"""A whole data set through the stream into one sealed table, with progress."""
+
+import platform
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from taojax import __version__
+from taojax.config import Config, to_toml
+from taojax.records import digest, refuse_if_taken, write_run
+from taojax.runtime.observations import Observations, load_observations
+from taojax.runtime.retrieval import N_KEPT, retrieve
+from taojax.runtime.stream import (
+    STATUSES,
+    Frame,
+    MapTables,
+    StreamRecord,
+    init,
+    map_tables,
+    replay,
+)
+
+CHUNK_FRAMES = 256
+"""Frames per scan; one compilation, and a progress bar that moves."""
+
+
+def candidates(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
+    """Return the `(T, 100)` map rows and similarities of every query, best first."""
+    if observations.retrievals is None:
+        return retrieve(observations.map_descriptors, observations.query_descriptors)
+    index, similarity = observations.retrievals
+    room = max(0, N_KEPT - index.shape[1])
+    index = np.pad(index[:, :N_KEPT], ((0, 0), (0, room)), constant_values=-1)
+    similarity = np.pad(similarity[:, :N_KEPT], ((0, 0), (0, room)))
+    return index, similarity
+
+
+def replay_log(
+    config: Config, tables: MapTables, frames: Frame, *, progress: bool = False
+) -> StreamRecord:
+    """Replay a whole log in chunks of one fixed shape.
+
+    Args:
+        config: settings; only the stream part is used.
+        tables: the map.
+        frames: numpy or JAX leaves with a leading time axis.
+        progress: draw a bar on stderr.
+
+    Returns:
+        One record per frame, as numpy arrays.
+    """
+    n_frames = len(frames.odometry)
+    state, parts = init(config.stream), []
+    with tqdm(total=n_frames, unit="frame", disable=not progress, leave=False) as bar:
+        for start in range(0, n_frames, CHUNK_FRAMES):
+            n = min(CHUNK_FRAMES, n_frames - start)
+            # The last chunk is padded with frames that never were; their records are dropped.
+            width = min(CHUNK_FRAMES, max(n, n_frames))
+            chunk = jax.tree.map(
+                lambda leaf, a=start, b=start + n, w=width: jnp.asarray(
+                    np.concatenate([leaf[a:b], np.repeat(leaf[b - 1 : b], w - (b - a), axis=0)])
+                ),
+                frames,
+            )
+            state, records = replay(config.stream, tables, chunk, state)
+            parts.append(jax.tree.map(lambda leaf, m=n: np.asarray(leaf)[:m], records))
+            bar.update(n)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def signal_table(t_s: np.ndarray, records: StreamRecord) -> dict[str, np.ndarray]:
+    """Return the columns of signals.csv."""
+    pose = np.where(records.has_pose[:, None], records.pose.astype(float), np.nan)
+    return {
+        "frame": np.arange(len(t_s)),
+        "t_s": t_s,
+        "status": np.array(STATUSES, dtype=object)[records.status],
+        "map_index": records.map_index,
+        "x_m": pose[:, 0],
+        "y_m": pose[:, 1],
+        "theta_rad": pose[:, 2],
+        **records.signals,
+    }
+
+
+def _facts(command: str, dataset: Path, seed: int) -> dict[str, Any]:
+    """Return what the manifest says of this machine and code."""
+    package = Path(__file__).parents[1]
+    sources = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    names = ("jax", "jaxlib", "equinox", "optimistix", "numpy")
+    return {
+        "command": command,
+        "dataset": str(dataset),
+        "seed": seed,
+        "versions": {
+            "python": platform.python_version(),
+            "taojax": __version__,
+            **{name: metadata.version(name) for name in names},
+        },
+        "code": digest(sources),
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def score(dataset: Path, out: Path, config: Config, *, progress: bool = False) -> dict[str, Any]:
+    """Score a data folder and seal the result; needs no truth and never looks for it.
+
+    Args:
+        dataset: a data folder, laid out as data_specs/README.md says.
+        out: run folder to make; must be absent or empty.
+        config: settings.
+        progress: draw a bar on stderr.
+
+    Returns:
+        The manifest as sealed.
+
+    Raises:
+        InputError: the data do not meet their spec, or `out` is taken.
+    """
+    refuse_if_taken(out)
+    observations = load_observations(dataset)
+    index, similarity = candidates(observations)
+    xyt = [observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")]
+    tables = map_tables(np.stack(xyt, axis=1))
+    frames = Frame(observations.odometry, index, similarity)
+    records = replay_log(config, tables, frames, progress=progress)
+    command = " ".join(["taojax", *sys.argv[1:]])
+    return write_run(
+        out,
+        signals=signal_table(observations.t_s, records),
+        map_poses=observations.map_poses,
+        index=index,
+        similarity=similarity,
+        config_toml=to_toml(config),
+        manifest={
+            **_facts(command, dataset, config.seed),
+            "notes": list(observations.notes),
+            "sha256": observations.sha256,
+        },
+    )

@@ -1,0 +1,334 @@
+"""Causal replay: one frame in, one record out, constant memory.
+
+tables = map_tables(poses)                      # once per map
+state = init(config)
+state, record = step(config, tables, state, frame)    # per frame
+state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from taojax.config import StreamConfig
+from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
+from taojax.core.procrustes import diagnose
+from taojax.core.se2 import compose, inverse
+from taojax.runtime import signals
+
+STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
+WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
+
+ESTABLISHED_SHARE = 0.5
+"""A branch is established when at least this share of the full window are its inliers."""
+
+FRESH_FRAMES = 3
+"""So many newest inliers in a row, far from the old alignment, are a kidnap."""
+
+GAP_FACTOR = 5.0
+"""Map steps longer than this many medians are gaps, not spacing."""
+
+
+class MapTables(eqx.Module):
+    """What `step` needs to know of the map; made once by `map_tables`."""
+
+    xy: Float[Array, "m 2"]
+    """Anchor positions, map frame [m]."""
+
+    theta: Float[Array, " m"]
+    """Anchor headings [rad]."""
+
+    spacing_m: Float[Array, ""]
+    """Median distance between neighbouring anchors; the unit of all length scales."""
+
+    extent_m: Float[Array, ""]
+    """Root mean square distance of the anchors from their centre: how little is known of a place
+    without any candidate."""
+
+
+class Frame(eqx.Module):
+    """What the robot knows at one instant. There is no field for the truth."""
+
+    odometry: Float[Array, "*t 3"]
+    """Motion from the frame before, in its body axes: forward [m], left [m], yaw [rad]."""
+
+    index: Int[Array, "*t c"]
+    """Retrieved map rows, best first, -1 = no candidate."""
+
+    similarity: Float[Array, "*t c"]
+    """Their similarities, at most 1."""
+
+
+class StreamState(eqx.Module):
+    """Everything remembered between frames; every shape is fixed by the config.
+
+    The window lies oldest first. It is shifted, not addressed as a ring: re-basing rewrites every
+    pose anyway, and the shift keeps time order for the velocity term.
+    """
+
+    p: Float[Array, "n 3"]
+    """Local poses of the window; the newest is the origin, so float32 stays exact."""
+
+    q: Float[Array, "n k 2"]
+    """Rank anchors."""
+
+    similarity: Float[Array, "n k"]
+    has_anchor: Bool[Array, "n k"]
+    is_filled: Bool[Array, " n"]
+    """False for frames before the start."""
+
+    top1: Float[Array, " h"]
+    """Past top-1 signals, oldest first."""
+
+    n_seen: Int[Array, ""]
+    """Frames so far; stops counting at the longest window, so that it never wraps."""
+
+    pose: Float[Array, "3"]
+    """Dead-reckoned from the last established alignment; meaningless before the first."""
+
+    was_established: Bool[Array, ""]
+    is_lost: Bool[Array, ""]
+
+
+class StreamRecord(eqx.Module):
+    """One row of the signal table."""
+
+    status: Int[Array, "*t"]
+    """Position in `STATUSES`."""
+
+    map_index: Int[Array, "*t"]
+    """The newest frame's anchor on the best branch, -1 without a pose."""
+
+    pose: Float[Array, "*t 3"]
+    """The robot on the best branch; zero without a pose."""
+
+    has_pose: Bool[Array, "*t"]
+    signals: dict[str, Float[Array, "*t"]]
+    """Column of data_specs/signals.toml -> value; always finite."""
+
+
+def map_spacing_m(xy: np.ndarray) -> float:
+    """Return the median step between consecutive map positions, zero steps and gaps ignored.
+
+    Args:
+        xy: `(M, 2)` metres, driving order.
+
+    Returns:
+        Metres; 1 where the map never moves.
+    """
+    steps = np.hypot(*np.diff(np.asarray(xy, float), axis=0).T)
+    steps = steps[steps > 1e-6]
+    if not steps.size:
+        return 1.0
+    return float(np.median(steps[steps <= GAP_FACTOR * np.median(steps)]))
+
+
+def map_tables(poses: np.ndarray) -> MapTables:
+    """Prepare a map for `step`.
+
+    Args:
+        poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
+    """
+    poses = np.asarray(poses, float)
+    centred = poses[:, :2] - poses[:, :2].mean(axis=0)
+    return MapTables(
+        xy=jnp.asarray(poses[:, :2], jnp.float32),
+        theta=jnp.asarray(poses[:, 2], jnp.float32),
+        spacing_m=jnp.asarray(map_spacing_m(poses[:, :2]), jnp.float32),
+        extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
+    )
+
+
+def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
+    """Return the weights of Eq. 1 with length scales in metres of this map."""
+    delta_m = config.delta_spacings * tables.spacing_m
+    mask_m = config.mask_deltas * delta_m
+    return CostParams(
+        lambda_velocity=config.lambda_velocity,
+        gamma_similarity=config.gamma_similarity,
+        tau_missing=config.tau_masks * huber(mask_m**2, delta_m),
+        delta_m=delta_m,
+        mask_m=mask_m,
+    )
+
+
+def init(config: StreamConfig) -> StreamState:
+    """Return the state before the first frame."""
+    n, k = config.window, config.branches
+    return StreamState(
+        p=jnp.zeros((n, 3)),
+        q=jnp.zeros((n, k, 2)),
+        similarity=jnp.zeros((n, k)),
+        has_anchor=jnp.zeros((n, k), bool),
+        is_filled=jnp.zeros(n, bool),
+        top1=jnp.zeros(max(signals.WINDOWS)),
+        n_seen=jnp.zeros((), jnp.int32),
+        pose=jnp.zeros(3),
+        was_established=jnp.zeros((), bool),
+        is_lost=jnp.zeros((), bool),
+    )
+
+
+def _push(window: Array, newest: Array) -> Array:
+    return jnp.concatenate([window[1:], newest[None]])
+
+
+def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array, Array, Array]:
+    """Return odometry, index and similarity of the K branches with every defect made harmless.
+
+    A frame whose odometry is not finite stands still and has no candidates, so that it can hurt
+    only the windows that contain it.
+    """
+    k = config.branches
+    is_usable = jnp.all(jnp.isfinite(frame.odometry))
+    odometry = jnp.where(is_usable, frame.odometry, 0.0)
+    room = max(0, k - frame.index.shape[0])
+    index = jnp.pad(frame.index[:k], (0, room), constant_values=-1)
+    similarity = jnp.pad(frame.similarity[:k], (0, room))
+    is_there = (index >= 0) & (index < tables.xy.shape[0]) & jnp.isfinite(similarity) & is_usable
+    return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
+
+
+def _watch(
+    state: StreamState, odometry: Array, best: BranchCost, has_pose: Array, is_full: Array, mask_m
+) -> tuple[Array, Array, Array]:
+    """Follow the last established alignment and notice when fresh evidence contradicts it.
+
+    Returns:
+        Dead-reckoned or newly established pose, whether one was ever established, whether the
+        robot is lost: moved without odometry noticing, and no branch established since.
+    """
+    predicted = compose(state.pose, odometry)
+    share = jnp.mean(best.is_inlier.astype(predicted.dtype))
+    is_established = has_pose & is_full & (share >= ESTABLISHED_SHARE)
+    gap = best.T_map_odom[:2] - predicted[:2]
+    is_far = jnp.hypot(gap[0], gap[1]) > mask_m
+    is_fresh = has_pose & jnp.all(best.is_inlier[-FRESH_FRAMES:])
+    is_noticed = state.was_established & is_fresh & is_far
+    is_lost = ~is_established & (state.is_lost | is_noticed)
+    pose = jnp.where(is_established, best.T_map_odom, predicted)
+    return pose, state.was_established | is_established, is_lost
+
+
+@eqx.filter_jit
+def step(
+    config: StreamConfig, tables: MapTables, state: StreamState, frame: Frame
+) -> tuple[StreamState, StreamRecord]:
+    """Advance by one frame.
+
+    Args:
+        config: fixed for the whole stream.
+        tables: the map, from `map_tables`.
+        state: from `init` or the previous `step`; same structure, shapes and dtypes come out.
+        frame: one observation. NaN and rows outside the map count as missing.
+
+    Returns:
+        The next state and this frame's record. Nothing is ever NaN or infinite; what went wrong
+        is in `status`.
+
+    Raises:
+        Nothing. Inputs are checked once, at the door, by `load_observations`.
+    """
+    odometry, index, similarity = _clean(config, tables, frame)
+    is_there = index >= 0
+    anchors = jnp.where(is_there[:, None], tables.xy[index], 0.0)
+    motion = jnp.broadcast_to(inverse(odometry), state.p.shape)
+    p = _push(compose(motion, state.p), jnp.zeros_like(odometry))
+    q, s = _push(state.q, anchors), _push(state.similarity, similarity)
+    has_anchor = _push(state.has_anchor, is_there)
+    is_filled = _push(state.is_filled, jnp.ones((), bool))
+    weight = is_filled / jnp.sum(is_filled)
+
+    params = cost_params(config, tables)
+    branches = Branch(jnp.swapaxes(q, 0, 1), s.T, has_anchor.T)
+    costs = jax.vmap(branch_cost, in_axes=(None, None, 0, None))(params, p[:, :2], branches, weight)
+    cheapest: BranchCost = jax.tree.map(lambda leaf: leaf[jnp.argmin(costs.total)], costs)
+    # The signal is the minimum over all branches; a pose needs a candidate in the newest frame.
+    has_candidates = jnp.any(is_there)
+    rank = jnp.argmin(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
+    best: BranchCost = jax.tree.map(lambda leaf: leaf[rank], costs)
+    shape = diagnose(p[:, :2], q[:, rank], weight * has_anchor[:, rank], config.eps)
+
+    n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *signals.WINDOWS))
+    history = _push(state.top1, signals.top1(similarity))
+    previous = state.q[-1, 0]
+    had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
+    windowed = {f"top1_w{n}": signals.windowed(history, n_seen, n) for n in signals.WINDOWS}
+    terms = {
+        "": cheapest.total,
+        "_geom": cheapest.geom,
+        "_vel": cheapest.vel,
+        "_sim": cheapest.sim,
+    }
+    values = {
+        "top1": signals.top1(similarity),
+        **windowed,
+        "margin": signals.margin(similarity),
+        "entropy": signals.entropy(similarity, is_there, config.entropy_temperature),
+        "velocity": jnp.where(
+            has_candidates,
+            signals.velocity(anchors[0], previous, had_previous & is_there[0], odometry),
+            tables.extent_m,
+        ),
+        "sue": jnp.where(
+            has_candidates, signals.sue(anchors, similarity, is_there), tables.extent_m**2
+        ),
+        "c_geom": 0.0 - shape.c_geom,
+        "a_aniso": shape.a_aniso,
+        "h_proxy": shape.h_proxy,
+        **{f"tao{name}": value for name, value in terms.items()},
+        **{f"tao_rank{name}": value for name, value in terms.items()},
+        "support": 1.0 - jnp.sum(best.is_inlier) / jnp.sum(is_filled),
+    }
+
+    is_warm = n_seen >= FRESH_FRAMES
+    has_pose = has_candidates & is_warm
+    pose, was_established, is_lost = _watch(
+        state, odometry, best, has_pose, is_filled[0], params.mask_m
+    )
+    status = jnp.select(
+        [~is_warm, ~has_candidates, best.is_degenerate, is_lost],
+        [WARMING_UP, NO_CANDIDATES, DEGENERATE, LOST],
+        OK,
+    )
+    record = StreamRecord(
+        status=status,
+        map_index=jnp.where(has_pose, index[rank], -1),
+        pose=jnp.where(has_pose, best.T_map_odom, 0.0),
+        has_pose=has_pose,
+        signals=values,
+    )
+    state = StreamState(
+        p=p,
+        q=q,
+        similarity=s,
+        has_anchor=has_anchor,
+        is_filled=is_filled,
+        top1=history,
+        n_seen=n_seen,
+        pose=pose,
+        was_established=was_established,
+        is_lost=is_lost,
+    )
+    return state, record
+
+
+@eqx.filter_jit
+def replay(
+    config: StreamConfig, tables: MapTables, frames: Frame, state: StreamState | None = None
+) -> tuple[StreamState, StreamRecord]:
+    """Run `step` over a whole log.
+
+    Args:
+        config: fixed for the whole stream.
+        tables: the map, from `map_tables`.
+        frames: every leaf with a leading time axis.
+        state: where to go on; from `init` when omitted.
+
+    Returns:
+        The final state and one record per frame, the same as from single steps.
+    """
+    start = init(config) if state is None else state
+    return jax.lax.scan(lambda carry, frame: step(config, tables, carry, frame), start, frames)
