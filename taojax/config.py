@@ -4,7 +4,7 @@ import dataclasses
 import math
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -14,7 +14,7 @@ from taojax.errors import ConfigError
 Scalar = float | int | Float[Array, ""]
 
 
-def _check_range(name: str, value: object, low: float, high: float = math.inf) -> None:
+def _check_range(name: str, value: object, low: float | int, high: float | int = math.inf) -> None:
     # Traced values (a sweep under vmap) carry no number to check; their author checked the grid.
     if isinstance(value, int | float) and not (low <= value < high):
         raise ConfigError(f"{name} must lie in [{low:g}, {high:g}), got {value!r}")
@@ -33,8 +33,8 @@ class StreamConfig(eqx.Module):
     branches: int = eqx.field(static=True, default=100)
     """*shape*. Hypotheses evaluated at once (the paper's K), at least 1."""
 
-    association: Literal["rank", "joint"] = eqx.field(static=True, default="rank")
-    """*shape*. What a branch is; `rank` is the paper's literal reading."""
+    association: str = eqx.field(static=True, default="rank")
+    """*shape*. What a branch is, `rank` or `joint`; `rank` is the paper's literal reading."""
 
     lambda_velocity: Scalar = 1.0
     """Weight of the velocity term of Eq. 1, dimensionless, >= 0."""

@@ -1,13 +1,15 @@
 """The door between robot and judge: one folder, written once, sealed, read only if unbroken."""
 
+import dataclasses
 import hashlib
 import io
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +21,8 @@ SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
 """Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
 
 
-class Run(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Run:
     """A sealed run, verified. All the judge may hear of the robot."""
 
     signals: dict[str, np.ndarray]
@@ -91,9 +94,8 @@ def publish(out: Path, files: Mapping[str, bytes]) -> None:
         InputError: `out` is taken (also by a process that was quicker), or cannot be written.
     """
     refuse_if_taken(out)
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
+    part = out.with_name(f".{out.name}.{secrets.token_hex(6)}.part")
     try:
-        shutil.rmtree(part, ignore_errors=True)
         for name, raw in files.items():
             write_atomically(part / name, raw)
         # Renaming onto an empty folder is allowed, onto a filled one it fails: one writer wins.

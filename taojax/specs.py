@@ -7,8 +7,10 @@ and writers take the column order from it, so a file and its documentation canno
 import functools
 import io
 import os
+import secrets
 import tomllib
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -221,7 +223,7 @@ def read_npz(path: Path, name: str) -> dict[str, np.ndarray]:
                 raise _fail(path, f"lacks the array {missing[0]}", "see data_specs/README.md")
             arrays = {spec["name"]: archive[spec["name"]] for spec in specs}
     except (ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError,
-            zipfile.BadZipFile, zipfile.zlib.error) as error:  # fmt: skip
+            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
         lines = str(error).splitlines() or [type(error).__name__]
         what = f"is not a plain npz archive ({lines[0][:80]})"
         raise _fail(path, what, "save it with np.savez") from error
@@ -237,7 +239,7 @@ def write_atomically(path: Path, data: bytes | str) -> None:
         InputError: the folder is read-only or the disk is full.
     """
     raw = data.encode() if isinstance(data, str) else data
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as stream:

@@ -35,41 +35,41 @@ class CostParams(eqx.Module):
 
 
 class Branch(eqx.Module):
-    """One hypothesis followed through the window, in time order."""
+    """One hypothesis followed through the window, in time order; a leading axis under `vmap`."""
 
-    q: Float[Array, "n 2"]
+    q: Float[Array, "*k n 2"]
     """Anchor of each frame, map frame [m]; anything finite where `has_anchor` is false."""
 
-    similarity: Float[Array, " n"]
+    similarity: Float[Array, "*k n"]
     """Frontend similarity of each anchor, at most 1."""
 
-    has_anchor: Bool[Array, " n"]
+    has_anchor: Bool[Array, "*k n"]
     """False where the frontend gave this branch no candidate."""
 
 
 class BranchCost(eqx.Module):
     """Eq. 1 at its minimiser, and what stands behind it."""
 
-    geom: Float[Array, ""]
+    geom: Float[Array, "*k"]
     """Sum of w rho_delta(residual) [m^2]."""
 
-    vel: Float[Array, ""]
+    vel: Float[Array, "*k"]
     """lambda mean |dq - R dp|^2 [m^2]."""
 
-    sim: Float[Array, ""]
+    sim: Float[Array, "*k"]
     """gamma sum of w (1 - s) [m^2]."""
 
-    T_map_odom: Float[Array, "3"]
+    T_map_odom: Float[Array, "*k 3"]
     """Alignment: the window's local frame in the map."""
 
-    is_inlier: Bool[Array, " n"]
+    is_inlier: Bool[Array, "*k n"]
     """Frames with an anchor within the residual mask of the alignment."""
 
-    is_degenerate: Bool[Array, ""]
+    is_degenerate: Bool[Array, "*k"]
     """The pairs do not determine the alignment; the terms are finite all the same."""
 
     @property
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Float[Array, "*k"]:
         """The minimised cost, C_TAO [m^2]."""
         return self.geom + self.vel + self.sim
 

@@ -25,26 +25,26 @@ class AngleEvidence(NamedTuple):
 class RigidFit(eqx.Module):
     """An alignment, and whether the pairs determine it."""
 
-    T_map_odom: Float[Array, "3"]
-    is_degenerate: Bool[Array, ""]
+    T_map_odom: Float[Array, "*k 3"]
+    is_degenerate: Bool[Array, "*k"]
 
 
 class Diagnostics(eqx.Module):
     """Singular values of the weighted cross-covariance H = X^T W Y (paper, section 3.2)."""
 
-    s1: Float[Array, ""]
+    s1: Float[Array, "*k"]
     """Larger singular value [m^2]."""
 
-    s2: Float[Array, ""]
+    s2: Float[Array, "*k"]
     """Smaller singular value [m^2]."""
 
-    c_geom: Float[Array, ""]
+    c_geom: Float[Array, "*k"]
     """s1 s2 = |det H| [m^4]: two-dimensional support."""
 
-    a_aniso: Float[Array, ""]
+    a_aniso: Float[Array, "*k"]
     """s1 / (s2 + eps): large on straight windows."""
 
-    h_proxy: Float[Array, ""]
+    h_proxy: Float[Array, "*k"]
     """-log(c_geom + eps)."""
 
 

@@ -1,8 +1,8 @@
 """The way in: sensor files become checked arrays here, and are believed from here on."""
 
+import dataclasses
 import tomllib
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from taojax.records import digest_file
 from taojax.specs import read_npy, read_npz, read_table, read_text
 
 
-class Retrievals(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Retrievals:
     """Answers of the place-recognition frontend, best first."""
 
     index: np.ndarray
@@ -21,7 +22,8 @@ class Retrievals(NamedTuple):
     """(T, K) float32, 0 where there is no candidate."""
 
 
-class Observations(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Observations:
     """All that the robot may know. There is no field for the truth."""
 
     map_poses: dict[str, np.ndarray]
@@ -33,11 +35,9 @@ class Observations(NamedTuple):
     odometry: np.ndarray
     """(T, 3) float32 motion from the frame before: forward [m], left [m], yaw [rad]."""
 
-    map_descriptors: np.ndarray | None
-    """(M, D), memory-mapped, not yet normalised; None where retrieval lists are given."""
-
-    query_descriptors: np.ndarray | None
-    """(T, D), likewise."""
+    descriptors: tuple[np.ndarray, np.ndarray] | None
+    """Map (M, D) and query (T, D), memory-mapped, not yet normalised; None where retrieval lists
+    are given."""
 
     retrievals: Retrievals | None
     """Lists made by the user's own frontend; None where descriptors are given."""
@@ -149,12 +149,12 @@ def load_observations(folder: Path) -> Observations:
     odometry = read_table(folder / files[1], "query_odometry")
     n_map, n_query = len(map_poses["t_s"]), len(odometry["t_s"])
     lists = folder / "query/retrievals.npz"
-    map_descriptors = query_descriptors = retrievals = None
+    descriptors = retrievals = None
     if lists.exists():
         retrievals = _load_retrievals(lists, n_map, n_query, folder / files[1])
         files.append("query/retrievals.npz")
     else:
-        map_descriptors, query_descriptors = _load_descriptors(folder, n_map, n_query)
+        descriptors = _load_descriptors(folder, n_map, n_query)
         files += ["map/descriptors.npy", "query/descriptors.npy"]
     notes = _load_notes(folder / "about.toml")
     files += ["about.toml"] if (folder / "about.toml").exists() else []
@@ -163,8 +163,7 @@ def load_observations(folder: Path) -> Observations:
         map_poses=map_poses,
         t_s=odometry["t_s"],
         odometry=motion.astype(np.float32),
-        map_descriptors=map_descriptors,
-        query_descriptors=query_descriptors,
+        descriptors=descriptors,
         retrievals=retrievals,
         notes=notes,
         sha256={f"inputs/{name}": digest_file(folder / name) for name in files},

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, to_toml
+from taojax.errors import InputError
 from taojax.records import digest, refuse_if_taken, write_run
 from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
@@ -32,9 +33,11 @@ CHUNK_FRAMES = 256
 
 def candidates(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
     """Return the `(T, 100)` map rows and similarities of every query, best first."""
+    if observations.descriptors is not None:
+        return retrieve(*observations.descriptors)
     if observations.retrievals is None:
-        return retrieve(observations.map_descriptors, observations.query_descriptors)
-    index, similarity = observations.retrievals
+        raise InputError("neither descriptors nor retrieval lists; see data_specs/README.md")
+    index, similarity = observations.retrievals.index, observations.retrievals.similarity
     room = max(0, N_KEPT - index.shape[1])
     index = np.pad(index[:, :N_KEPT], ((0, 0), (0, room)), constant_values=-1)
     similarity = np.pad(similarity[:, :N_KEPT], ((0, 0), (0, room)))
@@ -56,6 +59,7 @@ def replay_log(
         One record per frame, as numpy arrays.
     """
     n_frames = len(frames.odometry)
+    frames = jax.tree.map(np.asarray, frames)
     state, parts = init(config.stream), []
     with tqdm(total=n_frames, unit="frame", disable=not progress, leave=False) as bar:
         for start in range(0, n_frames, CHUNK_FRAMES):
@@ -81,11 +85,11 @@ def signal_table(t_s: np.ndarray, records: StreamRecord) -> dict[str, np.ndarray
         "frame": np.arange(len(t_s)),
         "t_s": t_s,
         "status": np.array(STATUSES, dtype=object)[records.status],
-        "map_index": records.map_index,
+        "map_index": np.asarray(records.map_index),
         "x_m": pose[:, 0],
         "y_m": pose[:, 1],
         "theta_rad": pose[:, 2],
-        **records.signals,
+        **{name: np.asarray(values) for name, values in records.signals.items()},
     }
 
 
@@ -128,7 +132,7 @@ def score(dataset: Path, out: Path, config: Config, *, progress: bool = False) -
     index, similarity = candidates(observations)
     xyt = [observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")]
     tables = map_tables(np.stack(xyt, axis=1))
-    frames = Frame(observations.odometry, index, similarity)
+    frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))
     records = replay_log(config, tables, frames, progress=progress)
     command = " ".join(["taojax", *sys.argv[1:]])
     return write_run(

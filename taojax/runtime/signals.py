@@ -5,7 +5,7 @@ missing one has similarity 0.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 WINDOWS = (5, 10, 20)
 """Lengths of the windowed top-1 signals, frames."""
@@ -20,9 +20,7 @@ def top1(similarity: Float[Array, " k"]) -> Float[Array, ""]:
     return 1.0 - similarity[0]
 
 
-def windowed(
-    history: Float[Array, " w"], n_seen: Float[Array, ""] | int, length: int
-) -> Float[Array, ""]:
+def windowed(history: Float[Array, " w"], n_seen: Int[Array, ""], length: int) -> Float[Array, ""]:
     """Return the mean of a signal over its last frames.
 
     Args:
@@ -32,7 +30,8 @@ def windowed(
     """
     age = jnp.arange(history.shape[0])[::-1]
     is_in = (age < length) & (age < n_seen)
-    return jnp.sum(jnp.where(is_in, history, 0.0)) / jnp.maximum(jnp.sum(is_in), 1)
+    count = jnp.sum(is_in.astype(history.dtype))
+    return jnp.sum(jnp.where(is_in, history, 0.0)) / jnp.maximum(count, 1.0)
 
 
 def margin(similarity: Float[Array, " k"]) -> Float[Array, ""]:

@@ -239,7 +239,8 @@ def step(
     q, s = _push(state.q, anchors), _push(state.similarity, similarity)
     has_anchor = _push(state.has_anchor, is_there)
     is_filled = _push(state.is_filled, jnp.ones((), bool))
-    weight = is_filled / jnp.sum(is_filled)
+    filled = is_filled.astype(p.dtype)
+    weight = filled / jnp.sum(filled)
 
     params = cost_params(config, tables)
     branches = Branch(jnp.swapaxes(q, 0, 1), s.T, has_anchor.T)
@@ -249,7 +250,7 @@ def step(
     has_candidates = jnp.any(is_there)
     rank = jnp.argmin(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
     best: BranchCost = jax.tree.map(lambda leaf: leaf[rank], costs)
-    shape = diagnose(p[:, :2], q[:, rank], weight * has_anchor[:, rank], config.eps)
+    shape = diagnose(p[:, :2], q[:, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
 
     n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *signals.WINDOWS))
     history = _push(state.top1, signals.top1(similarity))
@@ -280,7 +281,7 @@ def step(
         "h_proxy": shape.h_proxy,
         **{f"tao{name}": value for name, value in terms.items()},
         **{f"tao_rank{name}": value for name, value in terms.items()},
-        "support": 1.0 - jnp.sum(best.is_inlier) / jnp.sum(is_filled),
+        "support": 1.0 - jnp.sum(best.is_inlier.astype(p.dtype)) / jnp.sum(filled),
     }
 
     is_warm = n_seen >= FRESH_FRAMES

@@ -1,0 +1,91 @@
+"""Judge a sealed run and write what was found into its folder."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+from taojax.audit import figures, report, tables
+from taojax.audit.judgement import Evaluation, Judgement, judge
+from taojax.audit.truth import Truth, read_truth
+from taojax.audit.words import find_words, terminal_table
+from taojax.config import Config
+from taojax.records import read_run
+from taojax.specs import table_text, write_atomically
+
+__all__ = ["Evaluation", "evaluate"]
+
+
+def _command(run: Path, truth: Path, config: Config) -> str:
+    audit = config.audit
+    return (
+        f"taojax evaluate {run} --truth {truth} --r-in {audit.r_in_m:g} --r-out {audit.r_out_m:g}"
+    )
+
+
+def _settings(judgement: Judgement, truth: Truth) -> str:
+    """Return what the judge was told, so that a verdict can be repeated."""
+    audit = judgement.config.audit
+    facts = {
+        "schema": 1,
+        "run_seal": judgement.manifest["seal"],
+        "truth_sha256": truth.sha256,
+        "gap_frames": judgement.config.stream.window,
+        "seed": judgement.config.seed,
+        "audit": {f.name: getattr(audit, f.name) for f in dataclasses.fields(audit)},
+        "probability": judgement.model_note,
+    }
+    return json.dumps(facts, indent=2) + "\n"
+
+
+def _labels(judgement: Judgement) -> tables.Table:
+    return {
+        "frame": judgement.signals["frame"],
+        "label": judgement.label,
+        "nearest_m": judgement.nearest_m,
+        "split": judgement.splits.name,
+    }
+
+
+def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None) -> Evaluation:
+    """Judge a sealed run against the truth and write labels, verdicts, tables and report.
+
+    Judging again replaces the judge's files, each at once; the sealed ones are never touched.
+
+    Args:
+        run: folder with a sealed run.
+        truth: the truth folder of the same recording.
+        config: radii, split, thresholds, resamples and seed.
+        out: where to write; the run folder if omitted.
+
+    Returns:
+        What the command line prints and the summary over scenarios needs.
+
+    Raises:
+        InputError: broken seal, unreadable or foreign truth, folder that cannot be written.
+    """
+    sealed = read_run(run)
+    known = read_truth(truth, len(sealed.signals["frame"]))
+    judgement = judge(sealed, known, config)
+    pictures = figures.draw(judgement)
+    files: dict[str, str | bytes] = {
+        "labels.csv": table_text("labels", _labels(judgement)),
+        "verdicts.csv": table_text("verdicts", judgement.verdicts),
+        "metrics.csv": table_text("metrics", judgement.metrics),
+        "audit.json": _settings(judgement, known),
+    }
+    for name in ("metrics", "recall", "micro", "errors"):
+        files |= tables.as_files(name, getattr(judgement, name))
+    for drawn in pictures:
+        files |= figures.as_files(drawn)
+    done = Evaluation(
+        run=run,
+        judgement=judgement,
+        sentences=find_words(judgement),
+        table=terminal_table(judgement),
+        command=_command(run, truth, config),
+    )
+    files["report.html"] = report.run_page(done, pictures)
+    folder = out or run
+    for name, content in files.items():
+        write_atomically(folder / name, content)
+    return done

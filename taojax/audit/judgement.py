@@ -1,0 +1,138 @@
+"""Judge a run in memory: from sealed signals and truth to labels, verdicts and tables."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from taojax.audit import calibration, labels, metrics, tables
+from taojax.audit.truth import Truth
+from taojax.audit.verdicts import decide
+from taojax.config import Config
+from taojax.records import Run, signal_names
+
+
+class Judgement(NamedTuple):
+    """All that the judge concludes of one run."""
+
+    config: Config
+    manifest: dict[str, Any]
+    signals: dict[str, np.ndarray]
+    """Column -> (T,), the sealed table."""
+
+    map_m: Float[np.ndarray, "m 2"]
+    query_m: Float[np.ndarray, "t 2"]
+    """True positions, metres."""
+
+    nearest_m: Float[np.ndarray, " t"]
+    """Distance to the nearest map pose, metres."""
+
+    error_m: Float[np.ndarray, " t"]
+    """Distance from the answered pose to the truth, metres; NaN = no pose."""
+
+    label: Shaped[np.ndarray, " t"]
+    splits: labels.Splits
+    """Of the signals and of `fused`."""
+
+    outcome: Shaped[np.ndarray, " t"]
+    """Key of `plots.OUTCOMES` per frame."""
+
+    recall_curves: dict[float, np.ndarray]
+    """Radius [m] -> recall@1..K."""
+
+    verdicts: tables.Table
+    metrics: tables.Table
+    recall: tables.Table
+    micro: tables.Table
+    errors: tables.Table
+    model_note: str
+    """How the probability was made, in words."""
+
+    clock_gap_s: float
+    """Largest difference between the time stamps of run and truth."""
+
+
+def _outcomes(
+    verdict: np.ndarray, label: np.ndarray, error_m: np.ndarray, within_m: float
+) -> np.ndarray:
+    """Say of each frame what the verdict led to."""
+    is_wrong = (label == "map_out") | (error_m > within_m)
+    accepted = np.where(is_wrong, "accepted_wrong", "accepted_in")
+    rejected = np.where(label == "map_out", "rejected_out", "rejected_in")
+    outcome = np.where(verdict == "accept", accepted, rejected)
+    outcome = np.where(verdict == "abstain", "abstained", outcome)
+    return np.where(label == "grey", "grey", outcome)
+
+
+def judge(run: Run, truth: Truth, config: Config) -> Judgement:
+    """Judge a sealed run.
+
+    Args:
+        run: verified by `records.read_run`.
+        truth: of the same recording.
+        config: radii, split, thresholds and resamples; the window sets the gap.
+
+    Returns:
+        Labels, verdicts and tables.
+    """
+    audit = config.audit
+    map_m = np.stack([run.map_poses["x_m"], run.map_poses["y_m"]], axis=1)
+    nearest = labels.nearest_map_distance(truth.xy_m, map_m)
+    label = labels.label_frames(nearest, audit.r_in_m, audit.r_out_m)
+    signals = {name: run.signals[name] for name in signal_names()}
+
+    share, gap = audit.calibration_share, config.stream.window
+    first = labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
+    model = calibration.fit(first.calibration)
+    probability = calibration.predict(model, signals)
+    # Cut again with the probability beside the signals: only the splitter makes the two tables.
+    with_fused = signals | {tables.FUSED: probability}
+    splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)
+
+    verdicts = decide(run.signals, splits.calibration, probability, audit.sigmas)
+    error = np.hypot(run.signals["x_m"] - truth.xy_m[:, 0], run.signals["y_m"] - truth.xy_m[:, 1])
+    inside, test = label == "in_map", splits.name == "test"
+    accepted = verdicts["verdict"] == "accept"
+    groups = {
+        "test accepted": inside & test & accepted,
+        "test all": inside & test,
+        "all accepted": inside & accepted,
+        "all": inside,
+    }
+    curves = {r: metrics.recall_curve(run.index, truth.xy_m, map_m, r) for r in tables.RADII_M}
+    return Judgement(
+        config=config,
+        manifest=run.manifest,
+        signals=run.signals,
+        map_m=map_m,
+        query_m=truth.xy_m,
+        nearest_m=nearest,
+        error_m=error,
+        label=label,
+        splits=splits,
+        outcome=_outcomes(verdicts["verdict"], label, error, 2 * audit.r_in_m),
+        recall_curves=curves,
+        verdicts=verdicts,
+        metrics=tables.metrics_table(signals, label, splits, audit, config.seed),
+        recall=tables.recall_table(curves, nearest),
+        micro=tables.micro_table(signals, nearest, audit, config.seed),
+        errors=tables.errors_table(error, groups, 2 * audit.r_in_m),
+        model_note=model.note,
+        clock_gap_s=float(np.max(np.abs(truth.t_s - run.signals["t_s"]))),
+    )
+
+
+class Evaluation(NamedTuple):
+    """A judged run: what the command line prints, and what the summary over scenarios needs."""
+
+    run: Path
+    judgement: Judgement
+    sentences: tuple[str, ...]
+    """What was found, most important first."""
+
+    table: str
+    """The main signals as aligned text."""
+
+    command: str
+    """How to repeat the judging."""

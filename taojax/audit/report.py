@@ -1,0 +1,241 @@
+"""The report of one run, and the summary over several."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from taojax.audit import figures, summary, tables
+from taojax.audit.figures import Picture
+from taojax.audit.judgement import Evaluation, Judgement
+from taojax.audit.page import Cell, Grid, Page, grid, render
+from taojax.audit.words import metric_row, rate, span
+from taojax.specs import load_spec, write_atomically
+
+_ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")
+_TEST = (
+    "signal", "n_in_test", "n_out_test", "prevalence_test", "auroc_test", "aupr_out_test",
+    "aupr_in_test", "far_at_95_test",
+)  # fmt: skip
+SIMULATED = ("The world is simulated; nothing here was measured on the paper's recording.",)
+"""What the built-in world must say of itself."""
+
+_NOT_OURS = "Columns paper_* are the paper's figures on its own recording, not ours."
+_FROZEN = ("signal", "threshold", "far", "frr", "delay_frames", "n_exits", "n_censored")
+
+
+def _about(name: str) -> str:
+    return next(c["about"] for c in load_spec("metrics")["columns"] if c["name"] == name)
+
+
+def _big(value: float) -> str:
+    return "—" if np.isnan(value) else f"{value:.3f}"
+
+
+def _cards(judgement: Judgement) -> list[Cell]:
+    """Return the numbers of the first screen."""
+    test, row = judgement.splits.test.frame, metric_row(judgement, "tao")
+    verdict = judgement.verdicts["verdict"][test]
+    cards = [
+        Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", "verdicts.csv")
+        for word, said in (("accept", "accepted"), ("reject", "rejected"), ("abstain", "abstained"))
+    ]
+    far = f"FAR of tao, {span(row, 'far')}, n = {row['n_out_test']:.0f} map-out frames"
+    frr = f"FRR of tao, {span(row, 'frr')}, n = {row['n_in_test']:.0f} in-map frames"
+    auroc = f"AUROC of tao, {span(row, 'auroc')}, prevalence {row['prevalence']:.2f}"
+    return [
+        *cards,
+        Cell(_big(row["far"]), far, _about("far")),
+        Cell(_big(row["frr"]), frr, _about("frr")),
+        Cell(_big(row["auroc"]), auroc, _about("auroc")),
+    ]
+
+
+def _facts(done: Evaluation) -> dict[str, str]:
+    """Return the seal and everything that is needed to repeat the run."""
+    manifest, audit = done.judgement.manifest, done.judgement.config.audit
+    facts = {"seal": str(manifest["seal"])}
+    for key in ("command", "dataset", "device", "seed", "code"):
+        if key in manifest:
+            facts[key] = str(manifest[key])
+    for key in ("versions", "sha256"):
+        pairs = manifest.get(key)
+        if isinstance(pairs, dict):
+            facts[key] = "; ".join(f"{name} {value}" for name, value in sorted(pairs.items()))
+    facts["judged by"] = done.command
+    config = done.judgement.config
+    settings = {field.name: getattr(audit, field.name) for field in dataclasses.fields(audit)}
+    settings |= {"gap_frames": config.stream.window, "seed": config.seed}
+    facts["judge's settings"] = "; ".join(f"{name} = {v}" for name, v in settings.items())
+    return facts
+
+
+def _notes(judgement: Judgement) -> list[str]:
+    notes = judgement.manifest.get("notes", [])
+    return [notes] if isinstance(notes, str) else [str(note) for note in notes]
+
+
+def _micro_grids(micro: tables.Table) -> list[Grid]:
+    """Return the strict labels' table, one grid per radius."""
+    grids = []
+    for radius in np.unique(micro["radius_m"]):
+        part = {name: values[micro["radius_m"] == radius] for name, values in micro.items()}
+        title = f"Micro-scale audit: strictly within {radius:g} m"
+        columns = ("signal", "n_in", "n_out", "auroc")
+        grids.append(grid("micro", part, title=title, columns=columns))
+    return grids
+
+
+def _run_grids(judgement: Judgement) -> list[Grid]:
+    table = judgement.metrics
+    runtime = {name: values[:-1] for name, values in table.items()}
+    probability = {name: values[-1:] for name, values in table.items()}
+    scores = ("signal", "n_in_test", "n_out_test", "ece", "brier")
+    return [
+        grid("errors", judgement.errors, title="Localisation error of in-map frames"),
+        grid("recall", judgement.recall, title="Answerability and recall over all queries"),
+        grid("metrics", table, title="At the frozen threshold, on the test split", columns=_FROZEN),
+        grid("metrics", runtime, title="Separation over all labelled frames", columns=_ALL_FRAMES),
+        grid("metrics", table, title="Separation on the test split", columns=_TEST),
+        *_micro_grids(judgement.micro),
+        grid("metrics", probability, title="Calibrated probability", columns=scores),
+    ]
+
+
+def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
+    """Return the report of one run as one HTML file."""
+    judgement = done.judgement
+    audit = judgement.config.audit
+    dataset = judgement.manifest.get("dataset", done.run)
+    return render(
+        Page(
+            title=f"May these answers enter the graph? {Path(str(dataset)).name}",
+            subtitle=(
+                f"{len(judgement.label)} queries against {len(judgement.map_m)} map poses; in-map "
+                f"within {audit.r_in_m:g} m, map-out beyond {audit.r_out_m:g} m. "
+                f"Seal {str(judgement.manifest['seal'])[:16]}…"
+            ),
+            notes=_notes(judgement),
+            headline=done.sentences,
+            cards=_cards(judgement),
+            grids=_run_grids(judgement),
+            pictures=pictures,
+            facts=_facts(done),
+            command=done.command,
+        )
+    )
+
+
+def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> list[str]:
+    said = []
+    for name, done in summary.cut_maps(scenarios).items():
+        tao, top1 = (metric_row(done.judgement, signal) for signal in ("tao", "top1"))
+        said.append(
+            f"{name}: {int(tao['n_out'])} of {len(done.judgement.label)} queries are off the map. "
+            f"AUROC: tao {rate(tao, 'auroc')}, best similarity {rate(top1, 'auroc')}. False "
+            f"acceptance at the frozen threshold: tao {rate(tao, 'far')}, best similarity "
+            f"{rate(top1, 'far')} (n = {int(tao['n_out_test'])})."
+        )
+    micro = base.judgement.micro
+    for radius in np.unique(micro["radius_m"]):
+        here = micro["radius_m"] == radius
+        n_in, n_out = int(micro["n_in"][here][0]), int(micro["n_out"][here][0])
+        if n_in and n_out:
+            value = dict(zip(micro["signal"][here], micro["auroc"][here], strict=True))
+            said.append(
+                f"At {radius:g} m ({n_in} in, {n_out} out) the AUROC of the best similarity is "
+                f"{value['top1']:.3f}, of C_geom {value['c_geom']:.3f}, of tao {value['tao']:.3f} "
+                "(the paper, at 5 m: .543, SVD diagnostics .567)."
+            )
+        else:
+            which = "within" if n_in else "beyond"
+            said.append(
+                f"At {radius:g} m every query of the uncut map is {which} the radius: one class, "
+                "so there is no AUROC."
+            )
+    return said
+
+
+def _mapout_columns(key: str) -> tuple[str, ...]:
+    measured = (f"top1_{key}", f"paper_top1_{key}", f"velocity_{key}", f"tao_{key}")
+    return ("scenario", "map_out_frames", "paper_map_out_frames", *measured, f"paper_tao_{key}")
+
+
+def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
+    cards = []
+    for name, done in summary.cut_maps(scenarios).items():
+        row = metric_row(done.judgement, "tao")
+        cards.append(
+            Cell(_big(row["far"]), f"{name}: FAR of tao, {span(row, 'far')}", _about("far"))
+        )
+    return cards
+
+
+def write_summary(
+    out: Path,
+    scenarios: Mapping[str, Evaluation],
+    *,
+    command: str = "taojax audit",
+    notes: Sequence[str] = SIMULATED,
+) -> tuple[str, ...]:
+    """Write tables, figures and one page over all scenarios on top of their folders.
+
+    Args:
+        out: the folder that holds one run per scenario.
+        scenarios: name -> judged run; `full` is the map that was not cut.
+        command: what the user ran.
+        notes: printed on top, before those of the runs.
+
+    Returns:
+        What was found, in plain sentences.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    base = scenarios.get(summary.WHOLE, next(iter(scenarios.values())))
+    words = tuple(_summary_words(scenarios, base))
+    mapout, recall, micro = (
+        summary.mapout_table(scenarios), base.judgement.recall, base.judgement.micro,
+    )  # fmt: skip
+    pictures = (summary.maps(scenarios), figures.retrieval(base.judgement))
+    if summary.cut_maps(scenarios):
+        pictures = (summary.compare(scenarios), *pictures)
+    said = {note for done in scenarios.values() for note in _notes(done.judgement)}
+    notes = [*notes, *sorted(said - set(notes))]
+    seals = {name: str(done.judgement.manifest["seal"]) for name, done in scenarios.items()}
+    manifest = {"schema": 1, "command": command, "notes": notes, "scenarios": seals}
+    page = Page(
+        title="May these answers enter the graph? Summary over scenarios",
+        subtitle=f"{len(scenarios)} scenarios; each was scored, sealed and then judged.",
+        notes=notes,
+        headline=words,
+        cards=_summary_cards(scenarios),
+        grids=[
+            grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: AUROC",
+                 note=_NOT_OURS, columns=_mapout_columns("auroc")),
+            grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: FAR",
+                 note=_NOT_OURS, columns=_mapout_columns("far")),
+            grid("recall", recall, title="Answerability and recall, map not cut"),
+            grid("recall", summary.paper_recall_table(), title="The paper's Table 1",
+                 note="Printed for comparison.")._replace(source="the paper"),
+            *_micro_grids(micro),
+        ],
+        pictures=pictures,
+        facts={f"seal of {name}": seal for name, seal in seals.items()} | {"command": command},
+        command=command,
+        links={name: f"{name}/report.html" for name in scenarios},
+    )  # fmt: skip
+    files: dict[str, str | bytes] = {
+        "metrics.csv": summary.joined_metrics(scenarios),
+        "report.html": render(page),
+        "manifest.json": json.dumps(manifest, indent=2) + "\n",
+    }
+    for name, table in (("mapout", mapout), ("recall", recall), ("micro", micro)):
+        files |= tables.as_files(name, table)
+    for drawn in pictures:
+        files |= figures.as_files(drawn)
+    for name, content in files.items():
+        write_atomically(out / name, content)
+    return words

@@ -1,0 +1,186 @@
+"""What was found, in plain sentences."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from taojax.audit.judgement import Judgement
+from taojax.audit.verdicts import plain
+
+_JOIN_FRAMES = 5  # wrong acceptances this close together are told as one stretch
+_MOST_STRETCHES = 3
+_MOST = 0.5  # beyond this share a rate is called "most"
+
+
+def metric_row(judgement: Judgement, signal: str) -> dict[str, Any]:
+    """Return one row of metrics.csv by the name of its signal."""
+    table = judgement.metrics
+    at = list(table["signal"]).index(signal)
+    return {name: values[at] for name, values in table.items()}
+
+
+def span(row: Mapping[str, Any], name: str) -> str:
+    """Return the interval of a number in words.
+
+    A rate of exactly 0 or 1 is the same in every resample; printing that as an interval of no
+    width would promise what the bootstrap cannot know.
+    """
+    low, high = row[f"{name}_lo"], row[f"{name}_hi"]
+    if not np.isfinite(low):
+        return "no interval: too few resamples hold both classes"
+    if low == high:
+        return "not bounded: every resample agrees"
+    return f"95 % interval {low:.3f} to {high:.3f}"
+
+
+def rate(row: Mapping[str, Any], name: str) -> str:
+    """Return a number with its interval, as far as both exist."""
+    if np.isnan(row[name]):
+        return "not defined"
+    return f"{row[name]:.3f} ({span(row, name)})"
+
+
+def _counts(judgement: Judgement) -> list[str]:
+    test, verdict = judgement.splits.test, judgement.verdicts["verdict"]
+    n = len(test.frame)
+    if n == 0:
+        return ["The recording is too short to hold a test split: nothing is scored out of sample."]
+    count = {v: int((verdict[test.frame] == v).sum()) for v in ("accept", "reject", "abstain")}
+    return [
+        f"Of the {n} test frames ({test.frame[0]} to {test.frame[-1]}) taojax accepted "
+        f"{count['accept']}, rejected {count['reject']} and abstained on {count['abstain']}."
+    ]
+
+
+def _operating(judgement: Judgement) -> list[str]:
+    row, said = metric_row(judgement, "tao"), []
+    if np.isnan(row["threshold"]):
+        return ["The calibration split holds no in-map frame, so there is no threshold."]
+    n_in, n_out = int(row["n_in_test"]), int(row["n_out_test"])
+    rule = f"tao <= {plain(row['threshold'])}, frozen on the calibration split"
+    if n_out:
+        passed = round(row["far"] * n_out)
+        if row["far"] > _MOST:
+            said.append(
+                "At this threshold tao does not protect the map: it accepts most answers "
+                "given off the map."
+            )
+        said.append(
+            f"False acceptance rate {rate(row, 'far')}: {passed} of {n_out} map-out test frames "
+            f"(prevalence {row['prevalence_test']:.2f}) lie at {rule}."
+        )
+    else:
+        said.append(
+            f"The test split holds no map-out frame, so there is no false acceptance rate ({rule})."
+        )
+    if n_in:
+        lost = round(row["frr"] * n_in)
+        said.append(
+            f"False rejection rate {rate(row, 'frr')}: {lost} of {n_in} in-map test frames."
+        )
+    else:
+        said.append("The test split holds no in-map frame, so there is no false rejection rate.")
+    return said + _delays(row)
+
+
+def _delays(row: Mapping[str, Any]) -> list[str]:
+    n_exits = int(row["n_exits"])
+    if n_exits == 0:
+        return ["The test split holds no way out of the map, so there is no detection delay."]
+    if row["n_censored"] == n_exits:
+        return [f"Exits from the map: {n_exits}; none was noticed."]
+    return [
+        f"Exits from the map: {n_exits}, of which {int(row['n_censored'])} unnoticed; in the median "
+        f"the first rejection comes {row['delay_frames']:g} frames after the first map-out frame."
+    ]
+
+
+def _separation(judgement: Judgement) -> list[str]:
+    tao = metric_row(judgement, "tao")
+    n_in, n_out = int(tao["n_in"]), int(tao["n_out"])
+    audit = judgement.config.audit
+    n_grey = len(judgement.label) - n_in - n_out
+    grey = (
+        f" {n_grey} grey frames (between {audit.r_in_m:g} and {audit.r_out_m:g} m) are counted "
+        "and left out."
+        if n_grey
+        else ""
+    )
+    if not n_in or not n_out:
+        which = "in-map" if n_in else "map-out"
+        return [
+            f"All {n_in + n_out} labelled frames are {which}: with one class there is no AUROC, "
+            f"AUPR or FAR at 95 %; the recall and error tables stand.{grey}"
+        ]
+    top1, velocity = metric_row(judgement, "top1"), metric_row(judgement, "velocity")
+    return [
+        f"Over all {n_in + n_out} labelled frames ({n_in} in-map, {n_out} map-out) the AUROC of "
+        f"tao is {rate(tao, 'auroc')}, of the best similarity {rate(top1, 'auroc')}, of the "
+        f"velocity gate {rate(velocity, 'auroc')}.{grey}"
+    ]
+
+
+def _failures(judgement: Judgement) -> list[str]:
+    """Say where on the map wrong answers were accepted."""
+    is_test = judgement.splits.name == "test"
+    wrong = np.flatnonzero((judgement.outcome == "accepted_wrong") & is_test)
+    if not wrong.size:
+        return ["No test frame was accepted at a wrong place."] if is_test.any() else []
+    stretches = np.split(wrong, np.flatnonzero(np.diff(wrong) > _JOIN_FRAMES) + 1)
+    stretches.sort(key=len, reverse=True)
+    n_off = int((judgement.label[wrong] == "map_out").sum())
+    told = []
+    for frames in stretches[:_MOST_STRETCHES]:
+        x, y = np.median(judgement.query_m[frames], axis=0)
+        which = f"frames {frames[0]} to {frames[-1]}" if len(frames) > 1 else f"frame {frames[0]}"
+        told.append(f"{which} near x = {x:.0f} m, y = {y:.0f} m")
+    more = len(stretches) - len(told)
+    tail = (
+        f"; and {more} more stretch{'es' if more > 1 else ''} as short or shorter" if more else ""
+    )
+    return [
+        f"{len(wrong)} test frames were accepted at a wrong place ({n_off} off the map, "
+        f"{len(wrong) - n_off} in the map but more than {2 * judgement.config.audit.r_in_m:g} m "
+        f"off): {'; '.join(told)}{tail}."
+    ]
+
+
+def _errors(judgement: Judgement) -> list[str]:
+    table = judgement.errors
+    n = int(table["n"][0])
+    if n == 0:
+        return []
+    within = 2 * judgement.config.audit.r_in_m
+    return [
+        f"Where {n} in-map test frames were accepted, the pose is off by "
+        f"{table['median_m'][0]:.2f} m in the median and {table['p95_m'][0]:.2f} m at the 95th "
+        f"percentile; {table['share_within'][0]:.1%} lie within {within:g} m."
+    ]
+
+
+def _clock(judgement: Judgement) -> list[str]:
+    if judgement.clock_gap_s <= 1e-3:
+        return []
+    return [
+        f"The time stamps of truth and run differ by up to {judgement.clock_gap_s:g}; rows were "
+        "paired in order."
+    ]
+
+
+def find_words(judgement: Judgement) -> tuple[str, ...]:
+    """Return what was found, most important first."""
+    parts = (_counts, _operating, _failures, _errors, _separation)
+    said = [sentence for part in parts for sentence in part(judgement)]
+    return (*said, judgement.model_note, *_clock(judgement))
+
+
+def terminal_table(judgement: Judgement) -> str:
+    """Return the main signals as aligned text of at most 80 characters."""
+    columns = ("auroc", "far_at_95", "auroc_test", "threshold", "far", "frr", "delay_frames")
+    lines = [f"{'signal':<10}" + "".join(f"{name:>13}" for name in columns[:-1]) + f"{'delay':>8}"]
+    for signal in ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused"):
+        row = metric_row(judgement, signal)
+        cells = ["-" if np.isnan(row[name]) else f"{row[name]:.3f}" for name in columns]
+        lines.append(f"{signal:<10}" + "".join(f"{c:>13}" for c in cells[:-1]) + f"{cells[-1]:>8}")
+    return "\n".join(lines)

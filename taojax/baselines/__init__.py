@@ -1,0 +1,1 @@
+"""Rival systems on equal inputs, with the same output columns."""

@@ -1,0 +1,1 @@
+"""Makes data folders: simulated worlds, and edits of existing maps."""

@@ -1,0 +1,209 @@
+"""Figures. Each function draws on the Axes it is given and returns it; nothing is shown or saved.
+
+Colours are those of Okabe and Ito, distinct to colour-blind readers; line styles and markers
+repeat what they say.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+from matplotlib.axes import Axes
+
+IN_MAP, MAP_OUT, INK, PALE = "#0072B2", "#D55E00", "#222222", "#9a9a9a"
+CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
+STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), "-")
+
+
+class Mark(NamedTuple):
+    """How one outcome is drawn."""
+
+    label: str
+    colour: str
+    marker: str
+    size: float
+
+
+OUTCOMES = {
+    "abstained": Mark("abstained", PALE, "|", 22),
+    "grey": Mark("grey zone, not judged", "#c9c9c9", "_", 22),
+    "rejected_out": Mark("rejected, truly off the map", "#56B4E9", "^", 13),
+    "accepted_in": Mark("accepted, right place", IN_MAP, "o", 12),
+    "rejected_in": Mark("rejected though in the map", "#CC79A7", "s", 14),
+    "accepted_wrong": Mark("accepted, wrong place", MAP_OUT, "X", 30),
+}
+"""Outcome of a frame -> how it is drawn; the dangerous one last, on top."""
+
+
+def retrieval_curve(recall: Mapping[float, np.ndarray], *, ax: Axes) -> Axes:
+    """Draw recall@K over all queries.
+
+    Args:
+        recall: radius [m] -> recall@1..K.
+        ax: where to draw.
+    """
+    for number, (radius, curve) in enumerate(recall.items()):
+        k = np.arange(1, len(curve) + 1)
+        ax.plot(k, curve, color=CYCLE[number], linestyle=STYLES[number], label=f"{radius:g} m")
+    ax.set(xscale="log", xlabel="candidates K", ylabel="recall@K over all queries", ylim=(0, 1.02))
+    ax.set_xticks([1, 5, 10, 100], ["1", "5", "10", "100"])
+    ax.minorticks_off()
+    ax.grid(alpha=0.25)
+    ax.legend(title="right within", frameon=False)
+    return ax
+
+
+def signal_trace(
+    signal: Float[np.ndarray, " t"],
+    is_out: Bool[np.ndarray, " t"],
+    *,
+    name: str,
+    threshold: float,
+    test_start: int,
+    ax: Axes,
+) -> Axes:
+    """Draw one signal over the frames, shading those that truly lie off the map.
+
+    Args:
+        signal: larger = more likely off the map; NaN leaves a gap.
+        is_out: which frames are map-out.
+        name: with the unit; becomes the y label.
+        threshold: frozen on the calibration split; NaN draws none.
+        test_start: first frame of the test split.
+        ax: where to draw.
+    """
+    frame = np.arange(len(signal))
+    edges = np.flatnonzero(np.diff(np.r_[0, is_out.astype(int), 0]))
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        ax.axvspan(start - 0.5, end - 0.5, color=MAP_OUT, alpha=0.15, linewidth=0)
+    ax.plot(frame, signal, color=IN_MAP, linewidth=0.8)
+    if np.isfinite(threshold):
+        ax.axhline(threshold, color=INK, linestyle="--", linewidth=0.9)
+    ax.axvline(test_start, color=INK, linestyle=":", linewidth=0.9)
+    finite = signal[np.isfinite(signal)]
+    if finite.size:
+        # One wild frame must not flatten the rest; what is cut off still leaves at the top edge.
+        low, high = np.percentile(finite, (0, 99.5))
+        high = max(high, threshold) if np.isfinite(threshold) else high
+        pad = 0.06 * (high - low) or 0.5
+        ax.set_ylim(low - pad, high + pad)
+    ax.set_xlim(0, max(1, len(signal) - 1))
+    ax.set_ylabel(name, fontsize=8)
+    ax.tick_params(labelsize=8)
+    return ax
+
+
+def verdict_map(
+    map_m: Float[np.ndarray, "m 2"],
+    query_m: Float[np.ndarray, "t 2"],
+    matched_m: Float[np.ndarray, "t 2"],
+    outcome: Shaped[np.ndarray, " t"],
+    *,
+    ax: Axes,
+) -> Axes:
+    """Draw where answers were accepted, rejected and wrongly accepted.
+
+    Args:
+        map_m: map positions, metres.
+        query_m: true positions, metres.
+        matched_m: answered positions, metres; a line ties each wrong one to the truth.
+        outcome: keys of `OUTCOMES`.
+        ax: where to draw.
+    """
+    ax.scatter(*map_m.T, s=3, color="#b8b8b8", linewidths=0, label="map", zorder=1)
+    wrong = outcome == "accepted_wrong"
+    # Many lines together must not hide what lies below.
+    alpha = float(np.clip(40.0 / max(1, wrong.sum()), 0.1, 0.5))
+    for truth, answer in zip(query_m[wrong], matched_m[wrong], strict=True):
+        ax.plot(*np.stack([truth, answer], axis=1), color=MAP_OUT, linewidth=0.5, alpha=alpha)
+    for order, (name, mark) in enumerate(OUTCOMES.items()):
+        here = query_m[outcome == name]
+        if len(here):
+            ax.scatter(
+                *here.T, s=mark.size, color=mark.colour, marker=mark.marker, linewidths=0.7,
+                label=f"{mark.label} ({len(here)})", zorder=3 + order,
+            )  # fmt: skip
+    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    ax.set_adjustable("datalim")
+    ax.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncol=2)
+    return ax
+
+
+def curves(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], *, x: str, y: str, ax: Axes) -> Axes:
+    """Draw ROC or precision-recall curves on the unit square.
+
+    Args:
+        lines: name -> (x values, y values).
+        x: label of the x axis.
+        y: label of the y axis.
+        ax: where to draw.
+    """
+    for number, (name, (right, up)) in enumerate(lines.items()):
+        ax.plot(right, up, color=CYCLE[number], linestyle=STYLES[number], linewidth=1.3, label=name)
+    ax.set(xlabel=x, ylabel=y, xlim=(-0.01, 1.01), ylim=(-0.01, 1.01))
+    ax.grid(alpha=0.25)
+    ax.legend(frameon=False, fontsize=8)
+    return ax
+
+
+def reliability_diagram(
+    promised: Float[np.ndarray, " b"],
+    realised: Float[np.ndarray, " b"],
+    count: np.ndarray,
+    *,
+    ax: Axes,
+) -> Axes:
+    """Draw the realised share of map-out frames over the promised probability.
+
+    Args:
+        promised: mean probability per bin.
+        realised: share of map-out frames per bin.
+        count: `(b,)` frames per bin; written beside each point when they differ.
+        ax: where to draw.
+    """
+    ax.plot([0, 1], [0, 1], color=PALE, linestyle="--", label="perfectly calibrated")
+    label = f"{len(count)} bins of {count.min()} to {count.max()} frames"
+    ax.plot(promised, realised, color=IN_MAP, marker="o", markersize=5, label=label)
+    ax.set(
+        xlabel="promised probability of being map-out", ylabel="realised share of map-out frames",
+        xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal",
+    )  # fmt: skip
+    ax.grid(alpha=0.25)
+    ax.legend(frameon=False, fontsize=8, loc="upper left")
+    return ax
+
+
+def scenario_dots(
+    groups: Mapping[str, Float[np.ndarray, "s 3"]],
+    scenarios: tuple[str, ...],
+    *,
+    reference: Mapping[str, Float[np.ndarray, " s"]],
+    label: str,
+    ax: Axes,
+) -> Axes:
+    """Draw one number per scenario and signal with its interval.
+
+    Args:
+        groups: signal -> (value, low, high) per scenario; NaN = not measured.
+        scenarios: names on the x axis.
+        reference: signal -> published value per scenario, drawn as a hollow diamond.
+        label: of the y axis.
+        ax: where to draw.
+    """
+    at = np.arange(len(scenarios))
+    for number, (name, table) in enumerate(groups.items()):
+        x = at + 0.16 * (number - (len(groups) - 1) / 2)
+        value, low, high = table.T
+        ax.vlines(x, low, high, color=CYCLE[number], linewidth=1.5)
+        ax.scatter(x, value, color=CYCLE[number], marker="osD^v"[number % 5], s=28, label=name)
+        if name in reference:
+            ax.scatter(
+                x, reference[name], facecolors="none", edgecolors=INK, marker="D", s=42,
+                label="paper" if name == next(iter(reference)) else None,
+            )  # fmt: skip
+    ax.set_xticks(at, list(scenarios))
+    ax.set(ylabel=label, xlabel="scenario", xlim=(-0.6, len(scenarios) - 0.4), ylim=(-0.02, 1.02))
+    ax.grid(alpha=0.25, axis="y")
+    ax.legend(frameon=False, fontsize=8)
+    return ax

@@ -1,0 +1,63 @@
+"""A made-up robot whose truth is known, sealed like a real run, for the tests of the judge."""
+
+import numpy as np
+
+from taojax import records
+from taojax.config import AuditConfig, Config, StreamConfig, to_toml
+
+N_CANDIDATES = 100
+
+
+def config(**changes):
+    audit = {"r_in_m": 5.0, "r_out_m": 10.0, "n_bootstrap": 50, "block_frames": 20} | changes
+    return Config(stream=StreamConfig(window=10), audit=AuditConfig(**audit))
+
+
+def world(n=240, *, always_in=False, seed=7):
+    """Return truth positions and a map: a straight road whose middle parts were never mapped."""
+    rng = np.random.default_rng(seed)
+    x = np.cumsum(rng.uniform(1.5, 2.5, n))
+    truth = np.stack([x, rng.normal(0, 0.5, n)], axis=1)
+    map_x = np.arange(0.0, x[-1] + 4.0, 2.0)
+    phase = (map_x / x[-1] * 6) % 2  # three stretches with a map, three without
+    keep = np.full(len(map_x), True) if always_in else phase < 1.2
+    return truth, np.stack([map_x[keep], np.zeros(keep.sum())], axis=1)
+
+
+def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulated",)):
+    """Write a sealed run and its truth; return (run folder, truth folder)."""
+    rng = np.random.default_rng(seed + 1)
+    truth, map_m = world(n, always_in=always_in, seed=seed)
+    gap = np.linalg.norm(truth[:, None] - map_m[None], axis=2)
+    is_out = gap.min(axis=1) > 10
+    order = np.argsort(gap + rng.normal(0, 2, gap.shape), axis=1)[:, :N_CANDIDATES]
+    index = np.full((n, N_CANDIDATES), -1)
+    index[:, : order.shape[1]] = order
+    answer = map_m[index[:, 0]] + rng.normal(0, 0.3, (n, 2))
+    signals = {"frame": np.arange(n), "t_s": np.arange(n) * 0.5}
+    signals["status"] = np.full(n, "ok", dtype=object)
+    signals["status"][:2] = "warming_up"
+    if status is not None:
+        signals["status"][:] = status
+    signals["map_index"] = index[:, 0]
+    signals |= {"x_m": answer[:, 0], "y_m": answer[:, 1], "theta_rad": np.zeros(n)}
+    for number, name in enumerate(records.signal_names()):
+        signals[name] = rng.normal(0, 1, n) + (0.3 * (number % 8)) * is_out
+    signals["tao"] = signals["tao_geom"] + signals["tao_vel"] + signals["tao_sim"] + 4.0 * is_out
+    blank = np.full((len(map_m), 2), 0.0)
+    run = folder / "run"
+    records.write_run(
+        run,
+        signals=signals,
+        map_poses={"t_s": np.arange(len(map_m)), "x_m": map_m[:, 0], "y_m": map_m[:, 1]}
+        | {"theta_rad": blank[:, 0]},
+        index=index,
+        similarity=np.where(index >= 0, 0.5, 0.0),
+        config_toml=to_toml(config()),
+        manifest={"command": "taojax score made-up", "dataset": "made-up", "notes": list(notes)},
+    )
+    (folder / "truth").mkdir()
+    rows = [f"{0.5 * i},{x!r},{y!r},0.0" for i, (x, y) in enumerate(truth.tolist())]
+    text = "\n".join(["t_s,x_m,y_m,theta_rad", *rows]) + "\n"
+    (folder / "truth" / "query_poses.csv").write_text(text)
+    return run, folder / "truth"

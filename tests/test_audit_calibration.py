@@ -1,0 +1,154 @@
+"""Thresholds, probabilities and verdicts."""
+
+import numpy as np
+import pytest
+
+from taojax.audit import calibration, labels
+from taojax.audit.verdicts import decide
+
+
+def frames(rng, n_in, n_out, *, shift=3.0):
+    is_out = np.r_[np.zeros(n_in, bool), np.ones(n_out, bool)]
+    signals = {name: rng.normal(size=n_in + n_out) for name in calibration.FEATURES}
+    for name in ("top1", "tao"):
+        signals[name] = signals[name] + shift * is_out
+    return signals, np.where(is_out, "map_out", "in_map")
+
+
+def split_of(signals, label):
+    cut = labels.split_frames(
+        {k: np.r_[v, v] for k, v in signals.items()}, np.r_[label, label],
+        calibration_share=0.5, gap_frames=0,
+    )  # fmt: skip
+    return cut.calibration
+
+
+def test_sigma_threshold_is_mean_plus_sigmas_of_in_map_frames():
+    label = np.array(["in_map"] * 4 + ["map_out", "grey"])
+    split = split_of({"tao": np.array([1.0, 3.0, 1.0, 3.0, 100.0, 50.0])}, label)
+    assert calibration.sigma_threshold(split, "tao", 3.0) == pytest.approx(2.0 + 3.0)
+
+
+def test_the_threshold_of_a_probability_stays_below_one():
+    label = np.array(["in_map"] * 4)
+    split = split_of({"fused": np.array([0.2, 0.9, 0.4, 0.97])}, label)
+    plain = calibration.sigma_threshold(split, "fused", 3.0)
+    bounded = calibration.sigma_threshold(split, "fused", 3.0, is_probability=True)
+    assert plain > 1 > bounded > 0.9
+
+
+def test_there_is_no_threshold_without_an_in_map_frame():
+    split = split_of({"tao": np.array([1.0, 2.0])}, np.array(["map_out", "grey"]))
+    assert np.isnan(calibration.sigma_threshold(split, "tao", 3.0))
+
+
+def test_the_logistic_model_ranks_held_out_frames(rng):
+    model = calibration.fit(split_of(*frames(rng, 120, 80)))
+    signals, label = frames(rng, 100, 100)
+    p = calibration.predict(model, signals)
+    assert isinstance(model, calibration.Logistic)
+    assert ((p > 0) & (p < 1)).all()
+    pairs = p[label == "map_out"][:, None] > p[label == "in_map"][None]
+    assert pairs.mean() > 0.9
+
+
+def test_the_probability_follows_the_prior_of_the_calibration_split(rng):
+    few = calibration.predict(calibration.fit(split_of(*frames(rng, 190, 10, shift=0.0))),
+                              frames(rng, 50, 0)[0])  # fmt: skip
+    many = calibration.predict(calibration.fit(split_of(*frames(rng, 10, 190, shift=0.0))),
+                               frames(rng, 50, 0)[0])  # fmt: skip
+    assert few.mean() < 0.2
+    assert many.mean() > 0.8
+
+
+def test_a_probability_depends_on_its_own_frame_alone(rng):
+    model = calibration.fit(split_of(*frames(rng, 60, 40)))
+    signals, _ = frames(rng, 20, 20)
+    whole = calibration.predict(model, signals)
+    part = calibration.predict(model, {k: v[:13] for k, v in signals.items()})
+    np.testing.assert_array_equal(whole[:13], part)
+
+
+def test_a_constant_feature_leaves_finite_probabilities(rng):
+    signals, label = frames(rng, 30, 30)
+    signals["margin"] = np.zeros(60)
+    p = calibration.predict(calibration.fit(split_of(signals, label)), signals)
+    assert np.isfinite(p).all()
+
+
+@pytest.mark.parametrize("n_out", [0, calibration.LEAST_PER_CLASS - 1])
+def test_too_few_frames_of_a_class_give_a_fallback_that_says_so(rng, n_out):
+    model = calibration.fit(split_of(*frames(rng, 30, n_out)))
+    assert "fallback" in model.note
+    assert f"30 in-map and {n_out} map-out" in model.note
+    signals, _ = frames(rng, 40, 40)
+    p = calibration.predict(model, signals)
+    order = np.argsort(signals["tao"])
+    assert (np.diff(p[order]) >= 0).all()
+    assert ((p > 0) & (p < 1)).all()
+
+
+def test_without_an_in_map_frame_there_is_no_probability(rng):
+    signals, label = frames(rng, 0, 30)
+    model = calibration.fit(split_of(signals, label))
+    assert np.isnan(calibration.predict(model, signals)).all()
+    assert "No probability is given" in model.note
+
+
+def test_perfect_promises_have_no_calibration_error():
+    p = np.repeat([0.0, 1.0], 50)
+    assert calibration.ece(p, p == 1.0, np.ones((1, 100)))[0] == 0.0
+
+
+def test_calibration_error_of_a_constant_promise_is_its_distance_to_the_rate():
+    is_out = np.tile([True, False, False, False], 25)
+    got = calibration.ece(np.full(100, 0.75), is_out, np.ones((1, 100)))
+    # Equal-count bins of a constant split it by order: each holds the same mix, give or take one.
+    assert got[0] == pytest.approx(0.5, abs=1e-12)
+
+
+def test_reliability_bins_hold_equal_counts(rng):
+    bins = calibration.reliability(rng.random(103), rng.random(103) < 0.5)
+    assert bins.n_frames.sum() == 103
+    assert bins.n_frames.max() - bins.n_frames.min() <= 1
+    assert (np.diff(bins.promised) > 0).all()
+
+
+def judged(status, tao, *, in_map=True):
+    n = len(status)
+    signals = {"frame": np.arange(n), "status": np.array(status, dtype=object)}
+    signals |= {"tao": np.array(tao), "tao_geom": np.array(tao) * 0.2}
+    signals |= {"tao_vel": np.array(tao) * 0.7, "tao_sim": np.array(tao) * 0.1}
+    label = np.full(4, "in_map" if in_map else "map_out")
+    quiet = {"tao": np.array([1.0, 3.0, 1.0, 3.0])}
+    quiet |= {name: quiet["tao"] / 3 for name in ("tao_geom", "tao_vel", "tao_sim")}
+    return decide(signals, split_of(quiet, label), np.full(n, 0.5), 3.0)
+
+
+def test_tao_at_its_threshold_is_accepted_and_above_it_rejected():
+    verdicts = judged(["ok"] * 3, [5.0, 5.01, 0.0])
+    assert verdicts["verdict"].tolist() == ["accept", "reject", "accept"]
+
+
+def test_a_rejection_names_value_threshold_margin_and_loudest_term():
+    reason = judged(["ok"], [50.0])["reason"][0]
+    for piece in ("tao 50", "threshold 5", "by 45", "tao_vel"):
+        assert piece in reason
+
+
+@pytest.mark.parametrize("status", ["warming_up", "degenerate", "no_candidates", "lost"])
+def test_a_frame_that_cannot_be_judged_is_abstained_on_and_says_why(status):
+    verdicts = judged([status, "ok"], [0.0, 0.0])
+    assert verdicts["verdict"].tolist() == ["abstain", "accept"]
+    assert verdicts["reason"][0].startswith(status)
+
+
+def test_without_a_threshold_every_frame_is_abstained_on():
+    verdicts = judged(["ok", "ok"], [0.0, 99.0], in_map=False)
+    assert verdicts["verdict"].tolist() == ["abstain", "abstain"]
+    assert "no in-map frame" in verdicts["reason"][0]
+
+
+def test_no_reason_holds_a_comma():
+    verdicts = judged(["ok", "ok", "lost", "warming_up"], [0.0, 99.0, 0.0, 0.0])
+    assert not any("," in reason for reason in verdicts["reason"])

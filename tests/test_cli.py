@@ -1,0 +1,185 @@
+"""The command line: exit codes, one-line errors, and every file of the contract."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from taojax.cli import main
+from taojax.records import signal_names
+
+FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+VERBS = ("audit", "score", "evaluate", "simulate")
+
+
+def fails(capsys, code, *words):
+    """Run a command that must fail with one line; return the line."""
+    try:
+        got = main(list(words))
+    except SystemExit as stop:
+        got = stop.code
+    captured = capsys.readouterr()
+    assert got == code, captured.err
+    assert "Traceback" not in captured.err
+    return captured.err.strip()
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_shows_an_example_and_imports_neither_jax_nor_equinox(verb):
+    code = (
+        "import sys\nfrom taojax.cli import main\n"
+        f"try:\n    main([{verb!r}, '--help'])\n"
+        "except SystemExit as stop:\n    assert not stop.code\n"
+        "print([m for m in sys.modules if m in ('jax', 'equinox', 'pandas', 'matplotlib')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert f"Example: taojax {verb}" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    code = "import sys, taojax; print([m for m in sys.modules if m in ('jax', 'pandas')])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_score_seals_a_run_with_every_column(data_folder, tmp_path):
+    out = tmp_path / "run"
+    assert main(["score", str(data_folder), "--out", str(out), *FLAGS]) == 0
+    assert {path.name for path in out.iterdir()} == {
+        "manifest.json",
+        "config.toml",
+        "map_poses.csv",
+        "retrievals.npz",
+        "signals.csv",
+    }
+    lines = (out / "signals.csv").read_text().splitlines()
+    header = ["frame", "t_s", "status", "map_index", "x_m", "y_m", "theta_rad", *signal_names()]
+    assert lines[0].split(",") == header
+    assert len(lines) == 51
+    with np.load(out / "retrievals.npz") as arrays:
+        assert arrays["index"].shape == arrays["similarity"].shape == (50, 100)
+
+
+def test_config_of_a_run_runs_again_to_the_same_seal(data_folder, tmp_path):
+    a, b = tmp_path / "a", tmp_path / "b"
+    assert main(["score", str(data_folder), "--out", str(a), *FLAGS]) == 0
+    again = ["--config", str(a / "config.toml"), "--no-progress"]
+    assert main(["score", str(data_folder), "--out", str(b), *again]) == 0
+    assert (a / "signals.csv").read_bytes() == (b / "signals.csv").read_bytes()
+
+
+def test_flags_win_over_the_config_file(data_folder, tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("seed = 3\n[stream]\nwindow = 9\nbranches = 4\n")
+    words = ["--config", str(path), "--window", "7", "--no-progress"]
+    assert main(["score", str(data_folder), "--out", str(tmp_path / "run"), *words]) == 0
+    text = (tmp_path / "run" / "config.toml").read_text()
+    assert "window = 7" in text
+    assert "branches = 4" in text
+    assert "seed = 3" in text
+
+
+def test_audit_leaves_every_file_of_the_contract(data_folder, tmp_path, capfd):
+    out = tmp_path / "run"
+    words = ["--out", str(out), "--r-in", "3", "--r-out", "6", *FLAGS]
+    assert main(["audit", str(data_folder), *words]) == 0
+    for name in (
+        "manifest.json", "config.toml", "map_poses.csv", "retrievals.npz", "signals.csv",
+        "labels.csv", "verdicts.csv", "metrics.csv", "tables/recall.csv", "tables/micro.csv",
+        "report.html",
+    ):  # fmt: skip
+        assert (out / name).stat().st_size > 0, name
+    assert any((out / "figures").glob("*.png"))
+    assert any((out / "figures").glob("*.svg"))
+    rows = (out / "metrics.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows[1:]] == [*signal_names(), "fused"]
+    assert "r_in_m = 3.0" in (out / "config.toml").read_text()
+    page = (out / "report.html").read_text()
+    assert "<script src" not in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_a_broken_seal_is_exit_3_with_one_line(data_folder, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(["score", str(data_folder), "--out", str(out), *FLAGS]) == 0
+    capsys.readouterr()
+    raw = bytearray((out / "signals.csv").read_bytes())
+    raw[-9] ^= 1
+    (out / "signals.csv").write_bytes(raw)
+    truth = str(data_folder / "truth")
+    line = fails(capsys, 3, "evaluate", str(out), "--truth", truth)
+    assert "seal broken" in line
+    assert "\n" not in line
+
+
+def test_a_taken_out_is_exit_3_and_nothing_is_lost(data_folder, tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "mine.txt").write_text("keep")
+    for verb in ("score", "audit"):
+        line = fails(capsys, 3, verb, str(data_folder), "--out", str(tmp_path / "run"), *FLAGS)
+        assert "already holds" in line
+    assert (tmp_path / "run" / "mine.txt").read_text() == "keep"
+
+
+def test_bad_input_is_exit_3_with_one_line(data_folder, tmp_path, capsys):
+    (data_folder / "map/poses.csv").write_text("t_s,x_m\n")
+    line = fails(capsys, 3, "score", str(data_folder), "--out", str(tmp_path / "run"))
+    assert line.startswith("taojax: ")
+    assert "poses.csv" in line
+    assert "\n" not in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_bad_config_file_is_exit_3(data_folder, tmp_path, capsys):
+    (tmp_path / "c.toml").write_text("[stream]\nwindow = 1\n")
+    line = fails(capsys, 3, "score", str(data_folder), "--config", str(tmp_path / "c.toml"))
+    assert "c.toml" in line
+    assert "window" in line
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("score",),
+        ("fly",),
+        ("score", "x", "--window", "2"),
+        ("score", "x", "--window", "many"),
+        ("score", "x", "--association", "best"),
+        ("audit", "x", "--scenario", "h3"),
+        ("audit", "x", "--r-in", "-4"),
+    ],
+)
+def test_usage_errors_are_exit_2(words, capsys):
+    fails(capsys, 2, *words)
+
+
+def test_auditing_without_truth_says_what_to_do(data_folder, tmp_path, capsys):
+    (data_folder / "truth/query_poses.csv").unlink()
+    line = fails(capsys, 3, "audit", str(data_folder), "--out", str(tmp_path / "run"))
+    assert "query_poses.csv" in line
+    assert "taojax score" in line
+
+
+def test_a_surprise_is_exit_1(data_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("taojax.runtime.score.score", lambda *a, **k: 1 / 0)
+    assert main(["score", str(data_folder), "--out", str(tmp_path / "run")]) == 1
+    assert "internal error" in capsys.readouterr().err
+
+
+def test_an_interrupt_is_exit_130(data_folder, tmp_path, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("taojax.runtime.score.score", stop)
+    assert main(["score", str(data_folder), "--out", str(tmp_path / "run")]) == 130
+
+
+def test_simulate_writes_a_folder_that_scores(tmp_path):
+    world = tmp_path / "world"
+    assert main(["simulate", str(world), "--scenario", "h3"]) == 0
+    assert main(["score", str(world), "--out", str(tmp_path / "run"), *FLAGS]) == 0
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert any("simulated" in note for note in manifest["notes"])
