@@ -1,3 +1,59 @@
-"""taojax: am I lost, or just somewhere new, and may this loop closure enter my graph?"""
+"""taojax: am I lost, or just somewhere new, and may this loop closure enter my graph?
+
+The names a robot program needs. They are loaded on first use, so that importing the package costs
+nothing; none of them knows the judge.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from taojax.config import Config, StreamConfig
+    from taojax.errors import ConfigError, InputError, TaojaxError
+    from taojax.runtime.stream import (
+        STATUSES,
+        Frame,
+        MapTables,
+        StreamRecord,
+        StreamState,
+        init,
+        map_tables,
+        replay,
+        step,
+    )
+
+_HOMES = {
+    "taojax.config": ("Config", "StreamConfig"),
+    "taojax.errors": ("ConfigError", "InputError", "TaojaxError"),
+    "taojax.runtime.stream": (
+        "STATUSES", "Frame", "MapTables", "StreamRecord", "StreamState", "init", "map_tables",
+        "replay", "step",
+    ),
+}  # fmt: skip
+
+__all__ = [
+    "STATUSES",
+    "Config",
+    "ConfigError",
+    "Frame",
+    "InputError",
+    "MapTables",
+    "StreamConfig",
+    "StreamRecord",
+    "StreamState",
+    "TaojaxError",
+    "__version__",
+    "init",
+    "map_tables",
+    "replay",
+    "step",
+]
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(home), name)
+    raise AttributeError(f"module 'taojax' has no attribute {name!r}")

@@ -163,7 +163,8 @@ def reliability_diagram(
         ax: where to draw.
     """
     ax.plot([0, 1], [0, 1], color=PALE, linestyle="--", label="perfectly calibrated")
-    label = f"{len(count)} bins of {count.min()} to {count.max()} frames"
+    size = str(count.min()) if count.min() == count.max() else f"{count.min()} to {count.max()}"
+    label = f"{len(count)} bins of {size} frames"
     ax.plot(promised, realised, color=IN_MAP, marker="o", markersize=5, label=label)
     ax.set(
         xlabel="promised probability of being map-out", ylabel="realised share of map-out frames",
@@ -205,5 +206,6 @@ def scenario_dots(
     ax.set_xticks(at, list(scenarios))
     ax.set(ylabel=label, xlabel="scenario", xlim=(-0.6, len(scenarios) - 0.4), ylim=(-0.02, 1.02))
     ax.grid(alpha=0.25, axis="y")
-    ax.legend(frameon=False, fontsize=8)
+    # Above the panel: inside, some corner always holds a point.
+    ax.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=4)
     return ax

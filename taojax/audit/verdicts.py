@@ -76,8 +76,9 @@ def decide(
         is_above = tao > threshold
         verdict.append("reject" if is_above else "accept")
         reason.append(
-            f"tao {plain(tao)} {'exceeds' if is_above else 'is within'} threshold {plain(threshold)} "
-            f"by {plain(abs(tao - threshold))}; {_describe(terms[0][t], terms[1][t])}"
+            f"tao {plain(tao)} {'exceeds' if is_above else 'is within'} threshold "
+            f"{plain(threshold)} by "
+            f"{plain(abs(tao - threshold))}; {_describe(terms[0][t], terms[1][t])}"
         )
     return {
         "frame": signals["frame"],

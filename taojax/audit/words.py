@@ -91,8 +91,9 @@ def _delays(row: Mapping[str, Any]) -> list[str]:
     if row["n_censored"] == n_exits:
         return [f"Exits from the map: {n_exits}; none was noticed."]
     return [
-        f"Exits from the map: {n_exits}, of which {int(row['n_censored'])} unnoticed; in the median "
-        f"the first rejection comes {row['delay_frames']:g} frames after the first map-out frame."
+        f"Exits from the map: {n_exits}, of which {int(row['n_censored'])} unnoticed; in the "
+        f"median the first rejection comes {row['delay_frames']:g} frames after the first "
+        "map-out frame."
     ]
 
 

@@ -114,3 +114,13 @@ def whitening(
     scaled = jacobian * motion_variances(motion, alphas, least_variance)[:, None, :]
     covariance = scaled @ np.swapaxes(jacobian, 1, 2) + jitter * np.eye(3)
     return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def median_step_m(map_poses: Float[np.ndarray, "m 3"]) -> float:
+    """Return the median distance between consecutive map poses, steps of length 0 ignored [m].
+
+    1 where the map never moves.
+    """
+    steps = np.hypot(*np.diff(map_poses[:, :2], axis=0).T)
+    steps = steps[steps > 1e-6]
+    return float(np.median(steps)) if steps.size else 1.0

@@ -1,27 +1,29 @@
-"""Monte Carlo localisation over the plane, with and without random-particle injection."""
+"""Monte Carlo localisation over the plane, with and without random-particle injection.
+
+In NumPy: a thousand particles are a few kilobytes per frame, which the compiler does not speed up,
+and numpy's generator gives the same particles under every version of JAX.
+"""
 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Float, Int
 from sklearn.neighbors import KDTree
 
 from taojax.baselines.frames import Frames, Track, clean
 from taojax.baselines.models import (
     decay_rate,
     descriptor_distance,
+    median_step_m,
     motion_variances,
     rot_trans_rot,
 )
-from taojax.core.se2 import compose
 
 _CELLS = 128  # per side of the look-up grid
+_STORED = 8  # anchors remembered per cell; the nearest few are picked among them
 _HEADING_SD_RAD = 0.1  # around the map's heading when particles are scattered
-_TINY = 1e-30
-_STORED = 8  # anchors remembered per cell; the nearest three are picked among them
+_TINY = 1e-300  # keeps logarithms and ratios of vanishing weights finite
 
 
 class ParticleParams(eqx.Module):
@@ -58,8 +60,8 @@ class ParticleParams(eqx.Module):
     fast: float = 0.5
     """Weight of the newest frame in w_fast."""
 
-    score_m: float = 0.0
-    """Radius of the mass around the estimate [m]; 0 means six times the map's median step."""
+    score_steps: float = 6.0
+    """Radius of the mass around the estimate, in median steps of the map."""
 
     seed: int = 0
     """Seeds the particles."""
@@ -68,29 +70,11 @@ class ParticleParams(eqx.Module):
 class _Map(NamedTuple):
     """The map and a grid that finds the anchors near a point without a search."""
 
-    poses: Float[Array, "m 3"]
-    near: Int[Array, "c c s"]
-    low: Float[Array, "2"]
-    cell_m: Float[Array, "2"]
-    spacing_m: Float[Array, ""]
-
-
-class _Frame(NamedTuple):
-    """One frame as the filter sees it."""
-
-    motion: Float[Array, "*t 3"]
-    deviation: Float[Array, "*t 3"]
-    log_likelihood: Float[Array, "*t m"]
-    number: Int[Array, "*t"]
-
-
-class _Cloud(NamedTuple):
-    """The belief."""
-
-    pose: Float[Array, "p 3"]
-    log_weight: Float[Array, " p"]
-    slow: Float[Array, ""]
-    fast: Float[Array, ""]
+    poses: Float[np.ndarray, "m 3"]
+    near: Int[np.ndarray, "c s"]
+    low: Float[np.ndarray, "2"]
+    cell_m: Float[np.ndarray, "2"]
+    step_m: float
 
 
 def _map_of(poses: Float[np.ndarray, "m 3"]) -> _Map:
@@ -99,140 +83,77 @@ def _map_of(poses: Float[np.ndarray, "m 3"]) -> _Map:
     margin = 0.05 * max(float((high - low).max()), 1e-3)
     low, high = low - margin, high + margin
     cell = (high - low) / _CELLS
-    axes = [low[i] + (np.arange(_CELLS) + 0.5) * cell[i] for i in range(2)]
-    centre = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    n_stored = min(_STORED, len(xy))
-    near = KDTree(xy).query(centre, k=n_stored, return_distance=False)
-    steps = np.hypot(*np.diff(xy, axis=0).T) if len(xy) > 1 else np.ones(1)
-    steps = steps[steps > 1e-6]
-    return _Map(
-        poses=jnp.asarray(poses, jnp.float32),
-        near=jnp.asarray(near.reshape(_CELLS, _CELLS, n_stored), jnp.int32),
-        low=jnp.asarray(low, jnp.float32),
-        cell_m=jnp.asarray(cell, jnp.float32),
-        spacing_m=jnp.asarray(np.median(steps) if steps.size else 1.0, jnp.float32),
-    )
+    x, y = (low[i] + (np.arange(_CELLS) + 0.5) * cell[i] for i in range(2))
+    centre = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    near = KDTree(xy).query(centre, k=min(_STORED, len(xy)), return_distance=False)
+    return _Map(poses, near, low, cell, median_step_m(poses))
 
 
-def _scatter(world: _Map, key: Key[Array, ""], n: int) -> Float[Array, "p 3"]:
+def _scatter(world: _Map, rng: np.random.Generator, n: int) -> Float[np.ndarray, "p 3"]:
     """Draw particles around map poses, facing along the drive or against it."""
-    place, jitter, side = jax.random.split(key, 3)
-    node = jax.random.randint(place, (n,), 0, world.poses.shape[0])
-    spread = jnp.stack([world.spacing_m, world.spacing_m, jnp.asarray(_HEADING_SD_RAD)])
-    noise = jax.random.normal(jitter, (n, 3)) * spread[None]
-    turned = jnp.pi * jax.random.bernoulli(side, 0.5, (n,)).astype(noise.dtype)
-    return (world.poses[node] + noise).at[:, 2].add(turned)
+    spread = np.array([world.step_m, world.step_m, _HEADING_SD_RAD])
+    pose = world.poses[rng.integers(len(world.poses), size=n)]
+    pose = pose + rng.standard_normal((n, 3)) * spread[None]
+    pose[:, 2] += np.pi * rng.integers(2, size=n)
+    return pose
 
 
-def _move(pose: Float[Array, "p 3"], frame: _Frame, key: Key[Array, ""]) -> Float[Array, "p 3"]:
-    """Drive every particle by its own noisy copy of the odometry."""
-    noise = jax.lax.optimization_barrier(jax.random.normal(key, pose.shape))
-    drawn = frame.motion[None] + frame.deviation[None] * noise
-    first, drive, second = drawn.T
-    step = jnp.stack([drive * jnp.cos(first), drive * jnp.sin(first), first + second], axis=-1)
-    return compose(pose, step)
+def _move(
+    pose: Float[np.ndarray, "p 3"],
+    motion: Float[np.ndarray, "3"],
+    deviation: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "p 3"]:
+    """Drive every particle by its own noisy copy of turn, drive, turn."""
+    first, drive, second = (motion[:, None] + deviation[:, None] * rng.standard_normal((3, len(pose))))
+    course = pose[:, 2] + first
+    x, y = pose[:, 0] + drive * np.cos(course), pose[:, 1] + drive * np.sin(course)
+    return np.stack([x, y, course + second], axis=1)
 
 
-def _log_weights(
-    params: ParticleParams, world: _Map, pose: Float[Array, "p 3"], frame: _Frame
-) -> Float[Array, " p"]:
-    """Return the log of the sum over the nearest map poses of exp(-rate distance) p(z | node)."""
-    cell = jnp.floor((pose[:, :2] - world.low[None]) / world.cell_m[None]).astype(jnp.int32)
-    cell = jnp.clip(cell, 0, _CELLS - 1)
-    near = world.near[cell[:, 0], cell[:, 1]]
+def _votes(
+    params: ParticleParams,
+    world: _Map,
+    pose: Float[np.ndarray, "p 3"],
+    log_likelihood: Float[np.ndarray, " m"],
+) -> Float[np.ndarray, " p"]:
+    """Return the sum over the nearest map poses of exp(-rate distance) p(z | node).
+
+    The likelihoods are relative to that of the best node.
+    """
+    cell = ((pose[:, :2] - world.low[None]) / world.cell_m[None]).astype(int)
+    np.clip(cell, 0, _CELLS - 1, out=cell)
+    near = world.near[cell[:, 0] * _CELLS + cell[:, 1]]
     gap = world.poses[near, :2] - pose[:, None, :2]
-    distance = jax.lax.optimization_barrier(jnp.sqrt(jnp.sum(gap**2, axis=-1)))
-    farthest = jnp.zeros_like(distance[:, :1])
-    for _ in range(min(params.n_near, near.shape[1])):
-        # One pass per neighbour is much faster than a sort; equal distances count as one.
-        beyond = jnp.where(distance > farthest, distance, jnp.inf)
-        farthest = jnp.min(beyond, axis=1, keepdims=True)
-    vote = frame.log_likelihood[near] - params.near_rate * distance
-    return jax.nn.logsumexp(jnp.where(distance <= farthest, vote, -jnp.inf), axis=1)
+    distance = np.hypot(gap[..., 0], gap[..., 1])
+    n_near = min(params.n_near, near.shape[1])
+    nearest = np.argpartition(distance, n_near - 1, axis=1)[:, :n_near]
+    distance = np.take_along_axis(distance, nearest, axis=1)
+    node = np.take_along_axis(near, nearest, axis=1)
+    return np.exp(log_likelihood[node] - params.near_rate * distance).sum(axis=1)
 
 
-def _resample(
-    cloud: _Cloud, weight: Float[Array, " p"], is_due: Bool[Array, ""], key: Key[Array, ""]
-) -> _Cloud:
-    """Draw particles in proportion to their weight with one random offset (systematic)."""
-    n = weight.shape[0]
-    comb = (jnp.arange(n, dtype=weight.dtype) + jax.random.uniform(key)) / n
-    total = jnp.cumsum(weight)
-    chosen = jnp.clip(jnp.searchsorted(total / total[-1], comb), 0, n - 1)
-    return cloud._replace(
-        pose=jnp.where(is_due, cloud.pose[chosen], cloud.pose),
-        log_weight=jnp.where(is_due, -jnp.log(float(n)), cloud.log_weight),
-    )
+def _estimate(
+    pose: Float[np.ndarray, "p 3"], weight: Float[np.ndarray, " p"], radius_m: float
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return the mean pose around the heaviest particle, and the weight away from there.
+
+    A mean over all would lie between the modes of the cloud.
+    """
+    heavy = pose[np.argmax(weight)]
+    is_near = np.sum((pose[:, :2] - heavy[None, :2]) ** 2, axis=1) <= radius_m**2
+    share, near = weight[is_near], pose[is_near]
+    xy = share @ near[:, :2] / share.sum()
+    theta = np.arctan2(share @ np.sin(near[:, 2]), share @ np.cos(near[:, 2]))
+    return np.append(xy, theta), float(weight[~is_near].sum())
 
 
-def _step(
-    params: ParticleParams, world: _Map, cloud: _Cloud, frame: _Frame
-) -> tuple[_Cloud, tuple[Float[Array, ""], Int[Array, ""], Float[Array, "3"]]]:
-    """Take in one frame; returns signal, nearest node and estimate."""
-    key = jax.random.fold_in(jax.random.key(params.seed), frame.number)
-    moving, drawing, choosing, placing = jax.random.split(key, 4)
-    n = params.n_particles
-    pose = jnp.where(frame.number > 0, _move(cloud.pose, frame, moving), cloud.pose)
-    # Without the barriers XLA fuses the random numbers into every use and draws them again.
-    pose = jax.lax.optimization_barrier(pose)
-    log_vote = jax.lax.optimization_barrier(_log_weights(params, world, pose, frame))
-    log_weight = cloud.log_weight + log_vote
-    log_total = jax.nn.logsumexp(log_weight)
-    log_weight = log_weight - log_total
-    weight = jnp.exp(log_weight)
-
-    # The estimate is the mean of the particles around the heaviest: the cloud may have many modes.
-    heavy = pose[jnp.argmax(weight)]
-    radius = params.score_m if params.score_m > 0 else 6.0 * world.spacing_m
-    gap = pose[:, :2] - heavy[None, :2]
-    is_near = jnp.sum(gap**2, axis=-1) <= radius**2
-    share = jnp.where(is_near, weight, 0.0)
-    total = jnp.sum(share)
-    xy = heavy[:2] + jnp.sum(share[:, None] * jnp.where(is_near[:, None], gap, 0.0), 0) / total
-    heading = jnp.arctan2(
-        jnp.sum(share * jnp.sin(pose[:, 2])), jnp.sum(share * jnp.cos(pose[:, 2]))
-    )
-    estimate = jnp.concatenate([xy, heading[None]])
-    node = jnp.argmin(jnp.sum((world.poses[:, :2] - xy[None]) ** 2, axis=-1))
-
-    mean_vote = jnp.exp(log_total)
-    slow = jnp.where(
-        frame.number > 0, cloud.slow + params.slow * (mean_vote - cloud.slow), mean_vote
-    )
-    fast = jnp.where(
-        frame.number > 0, cloud.fast + params.fast * (mean_vote - cloud.fast), mean_vote
-    )
-    effective = 1.0 / jnp.sum(weight**2)
-    lag = jnp.clip(1.0 - fast / jnp.maximum(slow, _TINY), 0.0, 1.0)
-    injected = lag if params.injection else jnp.zeros_like(lag)
-    is_due = (effective < params.least_effective * n) | (injected > 0)
-    moved = _resample(_Cloud(pose, log_weight, slow, fast), weight, is_due, drawing)
-    is_new = jax.random.uniform(choosing, (n,)) < injected
-    fresh = _scatter(world, placing, n)
-    moved = moved._replace(pose=jnp.where(is_new[:, None], fresh, moved.pose))
-    return moved, (_signal(weight, is_near, log_total, fast), node, estimate)
-
-
-def _signal(weight, is_near, log_total, fast):
-    import os
-
-    k = os.environ.get("SIG", "mass")
-    if k == "mass":
-        return jnp.sum(jnp.where(is_near, 0.0, weight))
-    if k == "vote":
-        return -log_total
-    if k == "fast":
-        return -jnp.log(jnp.maximum(fast, _TINY))
-
-
-@eqx.filter_jit
-def _scan(
-    params: ParticleParams, world: _Map, frames: _Frame
-) -> tuple[Float[Array, " t"], Int[Array, " t"], Float[Array, "t 3"]]:
-    n = params.n_particles
-    pose = _scatter(world, jax.random.key(params.seed), n)
-    start = _Cloud(pose, jnp.full(n, -jnp.log(float(n))), jnp.zeros(()), jnp.zeros(()))
-    return jax.lax.scan(lambda c, f: _step(params, world, c, f), start, frames)[1]
+def _resample(weight: Float[np.ndarray, " p"], rng: np.random.Generator) -> Int[np.ndarray, " p"]:
+    """Choose particles in proportion to their weight with one random offset (systematic)."""
+    n = len(weight)
+    comb = (np.arange(n) + rng.random()) / n
+    total = np.cumsum(weight)
+    return np.minimum(np.searchsorted(total / total[-1], comb), n - 1)
 
 
 def particles(frames: Frames, params: ParticleParams | None = None) -> Track:
@@ -243,9 +164,10 @@ def particles(frames: Frames, params: ParticleParams | None = None) -> Track:
         params: published defaults when omitted.
 
     Returns:
-        The signal is the weight farther than `score_m` from the heaviest particle, in [0, 1]. The
-        pose is the mean of the particles around that one, `map_index` the map row nearest to it,
-        -1 until a frame tells nodes apart.
+        The signal is the weight farther than `score_steps` from the heaviest particle, in [0, 1];
+        with injection, where scattered particles dilute that mass on purpose, minus the log of
+        the mean unnormalised weight. The pose is the mean around the heaviest particle and
+        `map_index` the map row nearest to it, -1 until a frame tells nodes apart.
 
     Source:
         Dellaert et al., ICRA 1999; the measurement model of Xu, Suenderhauf and Milford, IEEE RA-L
@@ -254,23 +176,44 @@ def particles(frames: Frames, params: ParticleParams | None = None) -> Track:
     """
     params = ParticleParams() if params is None else params
     frames = clean(frames)
+    n, n_frames = params.n_particles, len(frames.odometry)
     distance = descriptor_distance(frames.rows)
     rate = decay_rate(distance, params.delta)
     motion = rot_trans_rot(frames.odometry)
     deviation = np.sqrt(motion_variances(motion, params.alphas, params.least_variance))
-    signal, node, pose = _scan(
-        params,
-        _map_of(frames.map_poses),
-        _Frame(
-            motion=jnp.asarray(motion, jnp.float32),
-            deviation=jnp.asarray(deviation, jnp.float32),
-            log_likelihood=jnp.asarray(-rate[:, None] * distance, jnp.float32),
-            number=jnp.arange(len(rate)),
-        ),
-    )
+    world = _map_of(frames.map_poses)
+    radius_m = params.score_steps * world.step_m
+
+    rng = np.random.default_rng(params.seed)
+    pose, weight = _scatter(world, rng, n), np.full(n, 1.0 / n)
+    slow = fast = 0.0
+    signal, node, estimate = np.zeros(n_frames), np.full(n_frames, -1), np.zeros((n_frames, 3))
+    for t in range(n_frames):
+        if t:
+            pose = _move(pose, motion[t], deviation[t], rng)
+        log_likelihood = -rate[t] * distance[t]
+        best = log_likelihood.max()
+        weight = weight * _votes(params, world, pose, log_likelihood - best)
+        total = weight.sum()
+        # A cloud so far from every map pose that nothing explains the frame keeps its belief.
+        weight = weight / total if total > _TINY else np.full(n, 1.0 / n)
+        log_mean = np.log(max(total, _TINY)) + best
+        estimate[t], away = _estimate(pose, weight, radius_m)
+        signal[t] = -log_mean if params.injection else away
+        node[t] = np.argmin(np.sum((world.poses[:, :2] - estimate[t, None, :2]) ** 2, axis=1))
+
+        vote = np.exp(log_mean)
+        slow = slow + params.slow * (vote - slow) if t else vote
+        fast = fast + params.fast * (vote - fast) if t else vote
+        share = max(0.0, 1.0 - fast / max(slow, _TINY)) if params.injection else 0.0
+        if share > 0 or 1.0 / np.sum(weight**2) < params.least_effective * n:
+            pose, weight = pose[_resample(weight, rng)], np.full(n, 1.0 / n)
+        is_new = rng.random(n) < share
+        if is_new.any():
+            pose[is_new] = _scatter(world, rng, int(is_new.sum()))
     is_there = rate > 0
     return Track(
-        signal=np.asarray(signal),
-        map_index=np.where(is_there, np.asarray(node), -1).astype(np.int32),
-        pose=np.where(is_there[:, None], np.asarray(pose), 0.0).astype(np.float32),
+        signal=signal.astype(np.float32),
+        map_index=np.where(is_there, node, -1).astype(np.int32),
+        pose=np.where(is_there[:, None], estimate, 0.0).astype(np.float32),
     )
