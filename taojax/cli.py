@@ -240,7 +240,8 @@ def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress
     for name in (only,) if only else SCENARIOS:
         _say(f"judging scenario {name} (simulated)")
         evaluations[name] = evaluate(out / name, out / "data" / name / "truth", config)
-    print("\n".join(write_summary(out, evaluations)))
+    command = " ".join(["taojax", *sys.argv[1:]])
+    print("\n".join(write_summary(out, evaluations, command=command)))
     _say(f"report: {out}/report.html")
 
 
