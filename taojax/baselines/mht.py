@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.baselines.frames import Frames, Track, clean
+from taojax.baselines.frames import Frames, clean
 from taojax.baselines.models import decay_rate, descriptor_distance, median_step_m
 
 _SAMPLED = 512  # nodes from which the crowding of the map is estimated
@@ -95,7 +95,10 @@ def _wrap(theta: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return (theta + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _move(pose: Float[np.ndarray, "l 3"], odometry: Float[np.ndarray, "3"]) -> np.ndarray:
+def _move(
+    pose: Float[np.ndarray, "l 3"], odometry: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "l 3"]:
+    """Drive every leaf by the odometry."""
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     moved = np.empty_like(pose)
     moved[:, 0] = pose[:, 0] + c * odometry[0] - s * odometry[1]
@@ -151,7 +154,8 @@ def _prune(params: MhtParams, leaves: _Leaves) -> _Leaves:
 
 def _crowding(map_poses: Float[np.ndarray, "m 3"], sigma_m: float) -> float:
     """Return how many map nodes a right candidate is spread over (median over the map)."""
-    sample = map_poses[np.linspace(0, len(map_poses) - 1, min(_SAMPLED, len(map_poses))).astype(int)]
+    n = len(map_poses)
+    sample = map_poses[np.linspace(0, n - 1, min(_SAMPLED, n)).astype(int)]
     squared = (sample[:, None, 0] - map_poses[None, :, 0]) ** 2
     squared += (sample[:, None, 1] - map_poses[None, :, 1]) ** 2
     return float(np.median(np.exp(-squared / (2.0 * sigma_m**2)).sum(axis=1)))

@@ -105,7 +105,8 @@ def _move(
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "p 3"]:
     """Drive every particle by its own noisy copy of turn, drive, turn."""
-    first, drive, second = (motion[:, None] + deviation[:, None] * rng.standard_normal((3, len(pose))))
+    noise = deviation[:, None] * rng.standard_normal((3, len(pose)))
+    first, drive, second = motion[:, None] + noise
     course = pose[:, 2] + first
     x, y = pose[:, 0] + drive * np.cos(course), pose[:, 1] + drive * np.sin(course)
     return np.stack([x, y, course + second], axis=1)

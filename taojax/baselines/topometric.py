@@ -68,13 +68,13 @@ class Segments(NamedTuple):
     direction 1 runs from the last node to the first.
     """
 
-    start: Float[np.ndarray, "3 d s m"]
+    start: Float[np.ndarray | Array, "3 d s m"]
     """Relative pose of the piece's beginning [m, m, rad]."""
 
-    extent: Float[np.ndarray, "3 d s m"]
+    extent: Float[np.ndarray | Array, "3 d s m"]
     """Its end minus its beginning."""
 
-    is_there: Bool[np.ndarray, "d s m"]
+    is_there: Bool[np.ndarray | Array, "d s m"]
     """False where the chain ends before."""
 
 

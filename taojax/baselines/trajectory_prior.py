@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
 from taojax.baselines.models import median_step_m
-from taojax.core.se2 import between, compose, wrap
+from taojax.core.se2 import between, compose, inverse, wrap
 
 
 class TrajectoryPriorParams(eqx.Module):
@@ -33,7 +33,7 @@ class TrajectoryPriorParams(eqx.Module):
     max_steps: int = 20
     """Iterations of the solver per frame."""
 
-    batch: int = 64
+    batch: int = 32
     """Frames solved at once; bounds memory."""
 
 
@@ -46,9 +46,10 @@ class _Graph(eqx.Module):
     anchor: Float[Array, "*t w 2"]
     """Position of each frame's top candidate [m]."""
 
+    heading: Float[Array, "*t"]
+    """Heading of the newest candidate [rad]."""
+
     has_anchor: Bool[Array, "*t w"]
-    start: Float[Array, "*t w 3"]
-    """First guess: the odometry hung on the newest candidate."""
 
 
 def _residuals(
@@ -68,74 +69,100 @@ def _residuals(
     # Geman-McClure: a wrong earlier retrieval costs at most 1 and does not bend the trajectory.
     is_newest = (jnp.arange(gap.shape[0]) == gap.shape[0] - 1)[:, None]
     tame = jnp.where(is_newest, 1.0, jax.lax.rsqrt(1.0 + squared))
-    return chain, jnp.where(graph.has_anchor[:, None], tame * gap, 0.0)
+    # A frame without a candidate says as little, and costs as much, as one with a wrong candidate.
+    missing = jnp.array([[1.0, 0.0]])
+    return chain, jnp.where(graph.has_anchor[:, None], tame * gap, missing)
+
+
+def _hang(graph: _Graph, heading: Float[Array, ""]) -> Float[Array, "w 3"]:
+    """Integrate the window backwards from the newest candidate, with the robot facing `heading`."""
+    newest = jnp.concatenate([graph.anchor[-1], heading[None]])
+
+    def back(
+        pose: Float[Array, "3"], motion: Float[Array, "3"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        earlier = compose(pose, inverse(motion))
+        return earlier, earlier
+
+    earlier = jax.lax.scan(back, newest, graph.odometry[1:], reverse=True)[1]
+    return jnp.concatenate([earlier, newest[None]])
 
 
 @eqx.filter_jit
 def _solve(
     params: TrajectoryPriorParams, graphs: _Graph, loop_sd: Float[Array, ""]
-) -> tuple[Float[Array, " t"], Float[Array, "t 3"]]:
+) -> Float[Array, "*t"]:
+    """Return the optimum cost of each graph, over both directions of travel."""
     solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-4)
     floor = jnp.array([params.least_m, params.drift_share, params.turn_sd_rad])
 
-    def cost(poses: Float[Array, "w 3"], args: tuple) -> Float[Array, ""]:
-        return 0.5 * sum(jnp.sum(part**2) for part in _residuals(poses, args))
-
-    def one(graph: _Graph) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    def one(graph: _Graph, turned: Float[Array, ""]) -> Float[Array, ""]:
         args = graph, loop_sd, floor
+        start = _hang(graph, graph.heading + turned)
+
+        def cost(poses: Float[Array, "w 3"]) -> Float[Array, ""]:
+            chain, loops = _residuals(poses, args)
+            return 0.5 * (jnp.sum(chain**2) + jnp.sum(loops**2))
+
         found = optx.least_squares(
-            _residuals, solver, graph.start, args, max_steps=params.max_steps, throw=False
+            _residuals, solver, start, args, max_steps=params.max_steps, throw=False
         )
-        before, after = cost(graph.start, args), cost(found.value, args)
-        # A solver that diverged, or stopped above its start, leaves the start in place.
-        is_better = after < before
-        return jnp.where(is_better, after, before), jnp.where(
-            is_better, found.value[-1], graph.start[-1]
-        )
+        # A solver that diverged leaves the start in place; a comparison with NaN is false.
+        before, after = cost(start), cost(found.value)
+        return jnp.where(after < before, after, before)
 
-    return jax.lax.map(one, graphs, batch_size=params.batch)
+    each = jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))
+    return jnp.min(each(graphs, jnp.array([0.0, jnp.pi])), axis=1)
 
 
-def _graphs(frames: Frames, window: int) -> tuple[_Graph, Float[np.ndarray, "t 2"]]:
-    """Cut one window per frame, each around its newest candidate; returns the origins taken out."""
-    n_frames = len(frames.odometry)
-    top = frames.index[:, 0] if frames.index.shape[1] else np.full(n_frames, -1)
-    back = np.arange(n_frames)[:, None] - np.arange(window)[::-1][None]
+def _windows(
+    frames: Frames, top: Int[np.ndarray, " t"], newest: Int[np.ndarray, " b"], window: int
+) -> _Graph:
+    """Cut the windows that end at the frames `newest`, each with its last candidate as origin."""
+    back = newest[:, None] - np.arange(window)[::-1][None]
     row = np.maximum(back, 0)
-    # Frames before the start stand still and have no candidate.
-    odometry = np.where((back >= 1)[..., None], frames.odometry[row], 0.0)
-    has_anchor = (back >= 0) & (top[row] >= 0)
     place = frames.map_poses[np.maximum(top, 0)]
-    origin = place[:, :2]
-    anchor = np.where(has_anchor[..., None], place[row, :2] - origin[:, None], 0.0)
-    return (
-        _Graph(
-            odometry=jnp.asarray(odometry, jnp.float32),
-            anchor=jnp.asarray(anchor, jnp.float32),
-            has_anchor=jnp.asarray(has_anchor),
-            start=_hang(jnp.asarray(odometry, jnp.float32), jnp.asarray(place[:, 2], jnp.float32)),
-        ),
-        origin,
+    # Frames before the start stand still and have no candidate.
+    has_anchor = (back >= 0) & (top[row] >= 0)
+    anchor = np.where(has_anchor[..., None], place[row, :2] - place[newest, None, :2], 0.0)
+    odometry = np.where((back >= 1)[..., None], frames.odometry[row], 0.0)
+    return _Graph(
+        odometry=jnp.asarray(odometry, jnp.float32),
+        anchor=jnp.asarray(anchor, jnp.float32),
+        heading=jnp.asarray(place[newest, 2], jnp.float32),
+        has_anchor=jnp.asarray(has_anchor),
     )
 
 
-@jax.jit
-def _hang(odometry: Float[Array, "t w 3"], heading: Float[Array, " t"]) -> Float[Array, "t w 3"]:
-    """Integrate each window backwards from the origin, where its newest pose is."""
-    from taojax.core.se2 import inverse
-
-    newest = jnp.stack([0.0 * heading, 0.0 * heading, heading], axis=-1)
-    poses = [newest]
-    for i in range(odometry.shape[1] - 1, 0, -1):
-        poses.append(compose(poses[-1], inverse(odometry[:, i])))
-    return jnp.stack(poses[::-1], axis=1)
-
-
 def trajectory_prior(frames: Frames, params: TrajectoryPriorParams | None = None) -> Track:
-    """placeholder."""
+    """Score the top candidate by how far it bends the trajectory of the last frames.
+
+    The window's odometry and the older frames' top candidates, which may be wrong and are weighed
+    robustly, form a pose graph; the newest candidate is added as a loop that has to hold.
+
+    Args:
+        frames: map and log; of the lists, the top candidates.
+        params: defaults when omitted.
+
+    Returns:
+        The signal is the optimum cost, dimensionless; without a candidate it is the cost of a loop
+        as long as the map. `map_index` is the top candidate, -1 without one.
+
+    Source:
+        The idea of ROVER, "Robust loop closure verification with trajectory prior in repetitive
+        environments", 2025, transferred from its abstract to planar windows.
+    """
     params = TrajectoryPriorParams() if params is None else params
     frames = clean(frames)
-    graphs, origin = _graphs(frames, params.window)
-    loop_sd = jnp.asarray(params.loop_steps * median_step_m(frames.map_poses), jnp.float32)
-    bend, newest = _solve(params, graphs, loop_sd)
-    return track_of_nodes(frames.map_poses, np.asarray(bend), np.where(np.asarray(graphs.has_anchor[:, -1]), frames.index[:, 0], -1))
+    n_frames = len(frames.odometry)
+    top = frames.index[:, 0] if frames.index.shape[1] else np.full(n_frames, -1)
+    loop_sd = params.loop_steps * median_step_m(frames.map_poses)
+    bend = np.empty(n_frames)
+    for start in range(0, n_frames, params.batch):
+        # Batches of one size compile once; frames after the end repeat the last one.
+        newest = np.minimum(np.arange(start, start + params.batch), n_frames - 1)
+        graphs = _windows(frames, top, newest, params.window)
+        bend[newest] = np.asarray(_solve(params, graphs, jnp.asarray(loop_sd, jnp.float32)))
+    extent_m = np.hypot(*np.ptp(frames.map_poses[:, :2], axis=0))
+    signal = np.where(top >= 0, bend, 0.5 * (extent_m / loop_sd) ** 2)
+    return track_of_nodes(frames.map_poses, signal.astype(np.float32), top)

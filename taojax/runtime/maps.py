@@ -1,0 +1,94 @@
+"""The map, prepared once: anchors, spacing, and the grid that joint association looks up."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
+
+from taojax.config import StreamConfig
+from taojax.core.association import AnchorGrid
+
+NEIGHBOURS = 12
+"""Anchors pooled around each anchor."""
+
+REACH_DELTAS = 3.0
+"""A grid cell knows an anchor within so many Huber thresholds."""
+
+MAX_CELLS = 1500
+"""Cells along the longer side at most; a larger map gets coarser cells, not more memory."""
+
+
+class MapTables(eqx.Module):
+    """What `step` needs to know of the map; made once by `map_tables`."""
+
+    grid: AnchorGrid
+    """Anchors and their look-up tables."""
+
+    spacing_m: Float[Array, ""]
+    """Median distance between neighbouring anchors; the unit of all length scales."""
+
+    extent_m: Float[Array, ""]
+    """Root mean square distance of the anchors from their centre: how little is known of a place
+    without any candidate."""
+
+
+def map_spacing_m(xy: np.ndarray) -> float:
+    """Return the median step between consecutive map positions while the robot was moving.
+
+    Args:
+        xy: `(M, 2)` metres, driving order.
+
+    Returns:
+        Metres; steps below a quarter of the 90 % quantile are standstill and do not count.
+        1 where the map never moves.
+    """
+    steps = np.hypot(*np.diff(np.asarray(xy, float), axis=0).T)
+    steps = steps[steps > 1e-6]
+    if not steps.size:
+        return 1.0
+    return float(np.median(steps[steps >= 0.25 * np.quantile(steps, 0.9)]))
+
+
+def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
+    xy = poses[:, :2]
+    tree = cKDTree(xy)
+    reach = REACH_DELTAS * delta_m
+    low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
+    cell_m = max(spacing_m, float((high - low).max()) / MAX_CELLS)
+    shape = np.ceil((high - low) / cell_m).astype(int) + 1
+    centres = [low[axis] + (np.arange(shape[axis]) + 0.5) * cell_m for axis in (0, 1)]
+    points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance, nearest = tree.query(points, distance_upper_bound=reach)
+    n_neighbours = min(NEIGHBOURS, len(xy))
+    gap, neighbour = tree.query(xy, k=n_neighbours)
+    gap, neighbour = gap.reshape(len(xy), -1), neighbour.reshape(len(xy), -1)
+    r = gap / delta_m
+    return AnchorGrid(
+        xy=jnp.asarray(xy, jnp.float32),
+        theta=jnp.asarray(poses[:, 2], jnp.float32),
+        nearest=jnp.asarray(np.where(np.isfinite(distance), nearest, -1), jnp.int32),
+        shape=jnp.asarray(shape, jnp.int32),
+        corner=jnp.asarray(low, jnp.float32),
+        cell_m=jnp.asarray(cell_m, jnp.float32),
+        neighbour=jnp.asarray(neighbour, jnp.int32),
+        neighbour_cost=jnp.asarray(np.where(r <= 1, 0.5 * r**2, r - 0.5), jnp.float32),
+    )
+
+
+def map_tables(poses: np.ndarray, config: StreamConfig | None = None) -> MapTables:
+    """Prepare a map for `step`.
+
+    Args:
+        poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
+        config: sets the Huber threshold in map spacings; defaults when omitted.
+    """
+    config = StreamConfig() if config is None else config
+    poses = np.asarray(poses, float)
+    spacing_m = map_spacing_m(poses[:, :2])
+    centred = poses[:, :2] - poses[:, :2].mean(axis=0)
+    return MapTables(
+        grid=_grid(poses, spacing_m, float(config.delta_spacings) * spacing_m),
+        spacing_m=jnp.asarray(spacing_m, jnp.float32),
+        extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
+    )
