@@ -12,14 +12,13 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from taojax.config import Config, StreamConfig
     from taojax.errors import ConfigError, InputError, TaojaxError
+    from taojax.runtime.maps import MapTables, map_tables
     from taojax.runtime.stream import (
         STATUSES,
         Frame,
-        MapTables,
         StreamRecord,
         StreamState,
         init,
-        map_tables,
         replay,
         step,
     )
@@ -27,9 +26,9 @@ if TYPE_CHECKING:
 _HOMES = {
     "taojax.config": ("Config", "StreamConfig"),
     "taojax.errors": ("ConfigError", "InputError", "TaojaxError"),
+    "taojax.runtime.maps": ("MapTables", "map_tables"),
     "taojax.runtime.stream": (
-        "STATUSES", "Frame", "MapTables", "StreamRecord", "StreamState", "init", "map_tables",
-        "replay", "step",
+        "STATUSES", "Frame", "StreamRecord", "StreamState", "init", "replay", "step",
     ),
 }  # fmt: skip
 

@@ -33,8 +33,9 @@ class StreamConfig(eqx.Module):
     branches: int = eqx.field(static=True, default=100)
     """*shape*. Hypotheses evaluated at once (the paper's K), at least 1."""
 
-    association: str = eqx.field(static=True, default="rank")
-    """*shape*. What a branch is, `rank` or `joint`; `rank` is the paper's literal reading."""
+    association: str = eqx.field(static=True, default="joint")
+    """*shape*. What a branch of `tao` is, `rank` or `joint`. `rank` is the paper's literal reading
+    and is always there as `tao_rank`."""
 
     lambda_velocity: Scalar = 1.0
     """Weight of the velocity term of Eq. 1, dimensionless, >= 0."""
@@ -52,6 +53,18 @@ class StreamConfig(eqx.Module):
     mask_deltas: Scalar = 3.0
     """Residual mask as a multiple of the Huber threshold, > 0."""
 
+    joint_window: int = eqx.field(static=True, default=40)
+    """*shape*. Frames that a joint branch remembers, at least 3; older ones weigh less anyway."""
+
+    joint_seeds: int = eqx.field(static=True, default=30)
+    """*shape*. Newest candidates that seed a joint branch, each in both travel directions."""
+
+    memory_frames: Scalar = 10.0
+    """Age at which a frame's weight in the joint cost has fallen to 1/e, frames, > 0."""
+
+    kappa_spacings: Scalar = 1.25
+    """Weight of the heading prior of a joint branch, in map spacings squared, >= 0."""
+
     entropy_temperature: Scalar = 0.05
     """Softmax temperature of the entropy signal, similarity units, > 0."""
 
@@ -64,9 +77,12 @@ class StreamConfig(eqx.Module):
         _check_range("branches", self.branches, 1, 1_000_001)
         if self.association not in ("rank", "joint"):
             raise ConfigError(f"association must be rank or joint, got {self.association!r}")
-        for name in ("lambda_velocity", "gamma_similarity", "tau_masks"):
+        _check_range("joint_window", self.joint_window, 3, 10_001)
+        _check_range("joint_seeds", self.joint_seeds, 1, 1_000_001)
+        for name in ("lambda_velocity", "gamma_similarity", "tau_masks", "kappa_spacings"):
             _check_range(name, getattr(self, name), 0.0)
-        for name in ("delta_spacings", "mask_deltas", "entropy_temperature", "eps"):
+        positive = ("delta_spacings", "mask_deltas", "memory_frames", "entropy_temperature", "eps")
+        for name in positive:
             _check_range(name, getattr(self, name), 1e-30)
 
 

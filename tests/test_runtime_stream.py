@@ -10,18 +10,11 @@ from conftest import loop, motions
 from taojax.config import Config, StreamConfig
 from taojax.records import signal_names
 from taojax.runtime import score
-from taojax.runtime.stream import (
-    STATUSES,
-    Frame,
-    MapTables,
-    init,
-    map_spacing_m,
-    map_tables,
-    replay,
-    step,
-)
+from taojax.runtime.maps import MapTables, map_spacing_m, map_tables
+from taojax.runtime.stream import STATUSES, Frame, init, replay, step
 
-SMALL = StreamConfig(window=8, branches=6)
+SMALL = StreamConfig(window=8, branches=6, joint_window=8, joint_seeds=4)
+RANK = StreamConfig(window=8, branches=6, association="rank")
 T, M = 40, 60
 
 
@@ -51,7 +44,7 @@ def test_every_signal_of_the_spec_is_recorded(rng):
 def test_stream_and_batch_give_the_same_records(rng):
     tables, frames = log(rng)
     _, batch = replay(SMALL, tables, frames)
-    state, single = init(SMALL), []
+    state, single = init(SMALL, tables), []
     for t in range(T):
         state, record = step(SMALL, tables, state, at(frames, t))
         single.append(record)
@@ -79,7 +72,7 @@ def test_step_compiles_once(rng):
         traces.append(1)
         return step(SMALL, tables, state, frame)
 
-    state = init(SMALL)
+    state = init(SMALL, tables)
     for t in range(5):
         state, _ = counted(state, at(frames, t))
     assert len(traces) == 1
@@ -87,7 +80,7 @@ def test_step_compiles_once(rng):
 
 def test_state_keeps_shapes_and_dtypes(rng):
     tables, frames = log(rng)
-    before = init(SMALL)
+    before = init(SMALL, tables)
     after, _ = step(SMALL, tables, before, at(frames, 0))
     shape = lambda tree: jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
     assert shape(before) == shape(after)
@@ -116,7 +109,7 @@ def test_the_literal_cost_equals_a_plain_rewrite_over_the_window(rng):
             y + np.sin(a) * dx + np.cos(a) * dy,
             a + da,
         ]
-    xy, spacing = np.asarray(tables.xy, float), float(tables.spacing_m)
+    xy, spacing = np.asarray(tables.grid.xy, float), float(tables.spacing_m)
     delta, mask = 3 * spacing, 9 * spacing
     for t in (2, n - 1, T - 1):
         past = np.arange(max(0, t - n + 1), t + 1)
@@ -178,9 +171,10 @@ def test_frames_without_candidates_are_flagged_and_the_stream_recovers(rng):
     assert finite(records)
     _, healthy = replay(SMALL, tables, frames)
     after = slice(20 + SMALL.window, None)
-    np.testing.assert_allclose(
-        records.signals["tao"][after], healthy.signals["tao"][after], rtol=1e-5
-    )
+    for name, rtol in (("tao_rank", 1e-5), ("tao", 1e-2)):
+        a, b = records.signals[name][after], healthy.signals[name][after]
+        # The running similarity scale remembers one answer less; nothing else may differ.
+        np.testing.assert_allclose(a, b, rtol=rtol)
 
 
 @pytest.mark.parametrize("field", ["odometry", "similarity"])
@@ -191,10 +185,10 @@ def test_nan_in_one_frame_hurts_only_the_windows_that_contain_it(field, rng):
     _, records = replay(SMALL, tables, Frame(**broken))
     assert finite(records)
     _, healthy = replay(SMALL, tables, frames)
-    for name in ("tao", "tao_rank_vel", "support", "sue"):
+    for name, rtol in (("tao", 1e-2), ("tao_rank_vel", 1e-5), ("support", 1e-5), ("sue", 1e-5)):
         a, b = np.asarray(records.signals[name]), np.asarray(healthy.signals[name])
         np.testing.assert_array_equal(a[:12], b[:12])
-        np.testing.assert_allclose(a[12 + SMALL.window :], b[12 + SMALL.window :], rtol=1e-5)
+        np.testing.assert_allclose(a[12 + SMALL.window :], b[12 + SMALL.window :], rtol=rtol)
 
 
 ODD = {
@@ -219,8 +213,8 @@ def test_odd_streams_give_finite_numbers_and_a_status_on_every_frame(kind, rng):
 
 def test_standing_still_is_degenerate(rng):
     tables, frames = log(rng)
-    _, records = replay(StreamConfig(window=8, branches=6, lambda_velocity=0.0), tables,
-                        ODD["standing still"](frames))  # fmt: skip
+    config = StreamConfig(window=8, branches=6, association="rank", lambda_velocity=0.0)
+    _, records = replay(config, tables, ODD["standing still"](frames))
     assert {STATUSES[s] for s in np.asarray(records.status)[5:]} == {"degenerate"}
 
 
@@ -233,12 +227,46 @@ def test_a_long_drive_equals_a_fresh_start_on_the_same_window(rng):
     )
 
 
+def test_rank_association_makes_tao_the_literal_cost(rng):
+    tables, frames = log(rng)
+    _, rank = replay(RANK, tables, frames)
+    _, joint = replay(SMALL, tables, frames)
+    np.testing.assert_array_equal(rank.signals["tao"], rank.signals["tao_rank"])
+    np.testing.assert_allclose(
+        rank.signals["tao_rank"], joint.signals["tao_rank"], rtol=1e-4, atol=1e-4
+    )
+    assert not np.allclose(joint.signals["tao"], joint.signals["tao_rank"])
+
+
+def test_joint_branches_follow_a_drive_in_the_opposite_direction(rng):
+    tables, frames = log(rng)
+    # The same log backwards: the robot meets every place facing the other way.
+    back = Frame(
+        jnp.roll(frames.odometry[::-1], 1, axis=0) * jnp.array([1.0, 1.0, -1.0]),
+        frames.index[::-1],
+        frames.similarity[::-1],
+    )
+    _, records = replay(SMALL, tables, back)
+    error = np.linalg.norm(np.asarray(records.pose)[8:, :2] - loop(T)[::-1][8:, :2], axis=1)
+    assert np.median(error) < 3 * float(tables.spacing_m)
+
+
+def test_a_frame_whose_candidates_all_miss_does_not_lose_the_place(rng):
+    tables, frames = log(rng)
+    wrong = (frames.index[20] + M // 2) % M
+    _, records = replay(
+        SMALL, tables, Frame(frames.odometry, frames.index.at[20].set(wrong), frames.similarity)
+    )
+    error = np.linalg.norm(np.asarray(records.pose)[20, :2] - loop(T)[20, :2])
+    assert error < 3 * float(tables.spacing_m)
+
+
 def test_a_robot_carried_off_in_the_dark_is_lost_until_a_branch_is_established(rng):
     tables, a = log(rng, n=60)
     # Two drives spliced: odometry says nothing, the places jump across the loop.
     frames = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:25], leaf[42:], leaf[:15]]), a)
     dark = Frame(frames.odometry, frames.index.at[20:32].set(-1), frames.similarity)
-    config = StreamConfig(window=12, branches=6, delta_spacings=0.7)
+    config = StreamConfig(window=12, branches=6, association="rank", delta_spacings=0.7)
     _, records = replay(config, tables, dark)
     words = [STATUSES[s] for s in np.asarray(records.status)]
     assert set(words[2:20]) == {"ok"}
@@ -259,7 +287,7 @@ def test_a_sweep_over_a_weight_is_one_vmap(rng):
     tables, frames = log(rng)
 
     def run(weight):
-        config = StreamConfig(window=8, branches=6, lambda_velocity=weight)
+        config = StreamConfig(window=8, branches=6, association="rank", lambda_velocity=weight)
         return replay(config, tables, frames)[1].signals["tao_rank_vel"]
 
     swept = jax.vmap(run)(jnp.array([0.0, 1.0]))

@@ -18,8 +18,9 @@ class Frames(NamedTuple):
     rows: Float[np.ndarray, "t m"]
     """Dense similarity, float32, at most 1; 0 where a retrieval list has no candidate."""
 
-    index: np.ndarray
-    """(T, K) int32 map rows retrieved, best first, -1 = no candidate."""
+    # A field of the log hides a method of tuple that nobody calls on one.
+    index: Int[np.ndarray, "t k"]  # pyright: ignore[reportIncompatibleMethodOverride]
+    """Retrieved map rows, best first, -1 = no candidate."""
 
     similarity: Float[np.ndarray, "t k"]
     """Their similarities, 0 where there is no candidate."""

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from taojax.config import StreamConfig
 from taojax.core.association import AnchorGrid
+from taojax.runtime.scale import map_scale
 
 NEIGHBOURS = 12
 """Anchors pooled around each anchor."""
@@ -31,6 +32,9 @@ class MapTables(eqx.Module):
     extent_m: Float[Array, ""]
     """Root mean square distance of the anchors from their centre: how little is known of a place
     without any candidate."""
+
+    scale: Float[Array, "2"]
+    """Background and strong similarity as the map shows them; NaN where it has no descriptors."""
 
 
 def map_spacing_m(xy: np.ndarray) -> float:
@@ -76,12 +80,16 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
     )
 
 
-def map_tables(poses: np.ndarray, config: StreamConfig | None = None) -> MapTables:
+def map_tables(
+    poses: np.ndarray, config: StreamConfig | None = None, descriptors: np.ndarray | None = None
+) -> MapTables:
     """Prepare a map for `step`.
 
     Args:
         poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
         config: sets the Huber threshold in map spacings; defaults when omitted.
+        descriptors: `(M, D)` of the map images; they fix the similarity scale, which is learnt
+            from past answers when omitted.
     """
     config = StreamConfig() if config is None else config
     poses = np.asarray(poses, float)
@@ -91,4 +99,7 @@ def map_tables(poses: np.ndarray, config: StreamConfig | None = None) -> MapTabl
         grid=_grid(poses, spacing_m, float(config.delta_spacings) * spacing_m),
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
         extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
+        scale=jnp.asarray(
+            [np.nan] * 2 if descriptors is None else map_scale(descriptors), jnp.float32
+        ),
     )

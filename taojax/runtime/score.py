@@ -15,15 +15,14 @@ from taojax import __version__
 from taojax.config import Config, to_toml
 from taojax.errors import InputError
 from taojax.records import digest, refuse_if_taken, write_run
+from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.stream import (
     STATUSES,
     Frame,
-    MapTables,
     StreamRecord,
     init,
-    map_tables,
     replay,
 )
 
@@ -60,7 +59,7 @@ def replay_log(
     """
     n_frames = len(frames.odometry)
     frames = jax.tree.map(np.asarray, frames)
-    state, parts = init(config.stream), []
+    state, parts = init(config.stream, tables), []
     with tqdm(total=n_frames, unit="frame", disable=not progress, leave=False) as bar:
         for start in range(0, n_frames, CHUNK_FRAMES):
             n = min(CHUNK_FRAMES, n_frames - start)
@@ -131,7 +130,8 @@ def score(dataset: Path, out: Path, config: Config, *, progress: bool = False) -
     observations = load_observations(dataset)
     index, similarity = candidates(observations)
     xyt = [observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")]
-    tables = map_tables(np.stack(xyt, axis=1))
+    known = observations.descriptors and observations.descriptors[0]
+    tables = map_tables(np.stack(xyt, axis=1), config.stream, known)
     frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))
     records = replay_log(config, tables, frames, progress=progress)
     command = " ".join(["taojax", *sys.argv[1:]])

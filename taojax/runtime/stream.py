@@ -6,17 +6,28 @@ state, record = step(config, tables, state, frame)    # per frame
 state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
+from taojax.core.association import look_up
+from taojax.core.cost import (
+    Branch,
+    BranchCost,
+    CostParams,
+    branch_cost,
+    huber,
+    squared_residuals,
+)
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import compose, inverse
 from taojax.runtime import signals
+from taojax.runtime.joint import JointReading, JointState, init_joint, joint_step
+from taojax.runtime.maps import MapTables
 
 STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
 WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
@@ -26,26 +37,6 @@ ESTABLISHED_SHARE = 0.5
 
 FRESH_FRAMES = 3
 """So many newest inliers in a row, far from the old alignment, are a kidnap."""
-
-GAP_FACTOR = 5.0
-"""Map steps longer than this many medians are gaps, not spacing."""
-
-
-class MapTables(eqx.Module):
-    """What `step` needs to know of the map; made once by `map_tables`."""
-
-    xy: Float[Array, "m 2"]
-    """Anchor positions, map frame [m]."""
-
-    theta: Float[Array, " m"]
-    """Anchor headings [rad]."""
-
-    spacing_m: Float[Array, ""]
-    """Median distance between neighbouring anchors; the unit of all length scales."""
-
-    extent_m: Float[Array, ""]
-    """Root mean square distance of the anchors from their centre: how little is known of a place
-    without any candidate."""
 
 
 class Frame(eqx.Module):
@@ -91,6 +82,9 @@ class StreamState(eqx.Module):
     was_established: Bool[Array, ""]
     is_lost: Bool[Array, ""]
 
+    joint: JointState | None
+    """Memory of the joint branches; None where `tao` is the rank cost."""
+
 
 class StreamRecord(eqx.Module):
     """One row of the signal table."""
@@ -109,38 +103,6 @@ class StreamRecord(eqx.Module):
     """Column of data_specs/signals.toml -> value; always finite."""
 
 
-def map_spacing_m(xy: np.ndarray) -> float:
-    """Return the median step between consecutive map positions, zero steps and gaps ignored.
-
-    Args:
-        xy: `(M, 2)` metres, driving order.
-
-    Returns:
-        Metres; 1 where the map never moves.
-    """
-    steps = np.hypot(*np.diff(np.asarray(xy, float), axis=0).T)
-    steps = steps[steps > 1e-6]
-    if not steps.size:
-        return 1.0
-    return float(np.median(steps[steps <= GAP_FACTOR * np.median(steps)]))
-
-
-def map_tables(poses: np.ndarray) -> MapTables:
-    """Prepare a map for `step`.
-
-    Args:
-        poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
-    """
-    poses = np.asarray(poses, float)
-    centred = poses[:, :2] - poses[:, :2].mean(axis=0)
-    return MapTables(
-        xy=jnp.asarray(poses[:, :2], jnp.float32),
-        theta=jnp.asarray(poses[:, 2], jnp.float32),
-        spacing_m=jnp.asarray(map_spacing_m(poses[:, :2]), jnp.float32),
-        extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
-    )
-
-
 def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
     """Return the weights of Eq. 1 with length scales in metres of this map."""
     delta_m = config.delta_spacings * tables.spacing_m
@@ -154,8 +116,8 @@ def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
     )
 
 
-def init(config: StreamConfig) -> StreamState:
-    """Return the state before the first frame."""
+def init(config: StreamConfig, tables: MapTables) -> StreamState:
+    """Return the state before the first frame on this map."""
     n, k = config.window, config.branches
     return StreamState(
         p=jnp.zeros((n, 3)),
@@ -168,6 +130,7 @@ def init(config: StreamConfig) -> StreamState:
         pose=jnp.zeros(3),
         was_established=jnp.zeros((), bool),
         is_lost=jnp.zeros((), bool),
+        joint=None if config.association == "rank" else init_joint(config, len(tables.grid.xy)),
     )
 
 
@@ -187,12 +150,83 @@ def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array
     room = max(0, k - frame.index.shape[0])
     index = jnp.pad(frame.index[:k], (0, room), constant_values=-1)
     similarity = jnp.pad(frame.similarity[:k], (0, room))
-    is_there = (index >= 0) & (index < tables.xy.shape[0]) & jnp.isfinite(similarity) & is_usable
+    is_there = (
+        (index >= 0) & (index < tables.grid.xy.shape[0]) & jnp.isfinite(similarity) & is_usable
+    )
     return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
 
 
+class _Answer(NamedTuple):
+    """What the best branch says of the newest frame, whatever the association."""
+
+    pose: Float[Array, "3"]
+    map_index: Int[Array, ""]
+    share: Float[Array, ""]
+    """Share of the filled window frames that are inliers."""
+
+    is_fresh: Bool[Array, ""]
+    """The newest frames are all inliers."""
+
+    is_degenerate: Bool[Array, ""]
+
+
+def _rank_answer(best: BranchCost, is_filled: Array, map_index: Array) -> _Answer:
+    n_filled = jnp.sum(is_filled.astype(best.geom.dtype))
+    return _Answer(
+        pose=best.T_map_odom,
+        map_index=map_index,
+        share=jnp.sum(best.is_inlier.astype(best.geom.dtype)) / n_filled,
+        is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
+        is_degenerate=best.is_degenerate,
+    )
+
+
+def _joint_answer(tables: MapTables, reading: JointReading) -> _Answer:
+    best = reading.best
+    n_filled = jnp.sum(reading.is_filled.astype(best.cost.dtype))
+    nearest = look_up(tables.grid, best.T_map_odom[None, :2])[0]
+    return _Answer(
+        pose=best.T_map_odom,
+        map_index=jnp.where(best.is_inlier[-1], best.anchor[-1], nearest),
+        share=jnp.sum(best.is_inlier.astype(best.cost.dtype)) / n_filled,
+        is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
+        # The heading prior determines the angle; without any inlier the seed itself is the pose.
+        is_degenerate=jnp.zeros((), bool),
+    )
+
+
+def _joint_terms(
+    config: StreamConfig, delta_m: Array, tables: MapTables, reading: JointReading
+) -> dict[str, Array]:
+    """Return the columns of the joint signal, in units of the Huber threshold squared."""
+    best = reading.best
+    q = tables.grid.xy[jnp.maximum(best.anchor, 0)]
+    turn = jnp.concatenate([jnp.zeros(2), best.T_map_odom[2:]])
+    mismatch = squared_residuals(turn, jnp.diff(reading.p, axis=0), jnp.diff(q, axis=0))
+    pair = (best.is_inlier[1:] & best.is_inlier[:-1]).astype(mismatch.dtype)
+    mean = jnp.sum(pair * mismatch) / jnp.maximum(jnp.sum(pair), 1.0)
+    return {
+        "tao": best.cost,
+        "tao_geom": best.geom,
+        # A term to look at; it couples neighbours, so it is no part of the joint objective.
+        "tao_vel": config.lambda_velocity * mean / delta_m**2,
+        "tao_sim": best.sim,
+        "tao_rival": reading.rival,
+    }
+
+
+def _spread(tables: MapTables, index: Array, similarity: Array) -> Array:
+    """Return the similarity of every map image; NaN where the list lacks it.
+
+    The list is enough: with 100 candidates no recording told the whole row apart from it.
+    """
+    m = tables.grid.xy.shape[0]
+    listed = jnp.where(index >= 0, index, m)
+    return jnp.full(m, jnp.nan).at[listed].set(similarity, mode="drop")
+
+
 def _watch(
-    state: StreamState, odometry: Array, best: BranchCost, has_pose: Array, is_full: Array, mask_m
+    state: StreamState, odometry: Array, answer: _Answer, has_pose: Array, is_full: Array, mask_m
 ) -> tuple[Array, Array, Array]:
     """Follow the last established alignment and notice when fresh evidence contradicts it.
 
@@ -201,14 +235,12 @@ def _watch(
         robot is lost: moved without odometry noticing, and no branch established since.
     """
     predicted = compose(state.pose, odometry)
-    share = jnp.mean(best.is_inlier.astype(predicted.dtype))
-    is_established = has_pose & is_full & (share >= ESTABLISHED_SHARE)
-    gap = best.T_map_odom[:2] - predicted[:2]
+    is_established = has_pose & is_full & (answer.share >= ESTABLISHED_SHARE)
+    gap = answer.pose[:2] - predicted[:2]
     is_far = jnp.hypot(gap[0], gap[1]) > mask_m
-    is_fresh = has_pose & jnp.all(best.is_inlier[-FRESH_FRAMES:])
-    is_noticed = state.was_established & is_fresh & is_far
+    is_noticed = state.was_established & has_pose & answer.is_fresh & is_far
     is_lost = ~is_established & (state.is_lost | is_noticed)
-    pose = jnp.where(is_established, best.T_map_odom, predicted)
+    pose = jnp.where(is_established, answer.pose, predicted)
     return pose, state.was_established | is_established, is_lost
 
 
@@ -233,7 +265,7 @@ def step(
     """
     odometry, index, similarity = _clean(config, tables, frame)
     is_there = index >= 0
-    anchors = jnp.where(is_there[:, None], tables.xy[index], 0.0)
+    anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
     motion = jnp.broadcast_to(inverse(odometry), state.p.shape)
     p = _push(compose(motion, state.p), jnp.zeros_like(odometry))
     q, s = _push(state.q, anchors), _push(state.similarity, similarity)
@@ -257,12 +289,22 @@ def step(
     previous = state.q[-1, 0]
     had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
     windowed = {f"top1_w{n}": signals.windowed(history, n_seen, n) for n in signals.WINDOWS}
-    terms = {
-        "": cheapest.total,
-        "_geom": cheapest.geom,
-        "_vel": cheapest.vel,
-        "_sim": cheapest.sim,
+    rank_terms = {
+        "tao_rank": cheapest.total,
+        "tao_rank_geom": cheapest.geom,
+        "tao_rank_vel": cheapest.vel,
+        "tao_rank_sim": cheapest.sim,
     }
+    if state.joint is None:
+        joint = None
+        terms = {name.replace("_rank", ""): value for name, value in rank_terms.items()}
+        terms["tao_rival"] = terms["tao"]
+        answer = _rank_answer(best, is_filled, index[rank])
+    else:
+        row = _spread(tables, index, similarity)
+        joint, reading = joint_step(config, tables, state.joint, odometry, index, row)
+        terms = _joint_terms(config, params.delta_m, tables, reading)
+        answer = _joint_answer(tables, reading)
     values = {
         "top1": signals.top1(similarity),
         **windowed,
@@ -279,25 +321,25 @@ def step(
         "c_geom": 0.0 - shape.c_geom,
         "a_aniso": shape.a_aniso,
         "h_proxy": shape.h_proxy,
-        **{f"tao{name}": value for name, value in terms.items()},
-        **{f"tao_rank{name}": value for name, value in terms.items()},
-        "support": 1.0 - jnp.sum(best.is_inlier.astype(p.dtype)) / jnp.sum(filled),
+        **terms,
+        **rank_terms,
+        "support": 1.0 - answer.share,
     }
 
     is_warm = n_seen >= FRESH_FRAMES
     has_pose = has_candidates & is_warm
     pose, was_established, is_lost = _watch(
-        state, odometry, best, has_pose, is_filled[0], params.mask_m
+        state, odometry, answer, has_pose, is_filled[0], params.mask_m
     )
     status = jnp.select(
-        [~is_warm, ~has_candidates, best.is_degenerate, is_lost],
+        [~is_warm, ~has_candidates, answer.is_degenerate, is_lost],
         [WARMING_UP, NO_CANDIDATES, DEGENERATE, LOST],
         OK,
     )
     record = StreamRecord(
         status=status,
-        map_index=jnp.where(has_pose, index[rank], -1),
-        pose=jnp.where(has_pose, best.T_map_odom, 0.0),
+        map_index=jnp.where(has_pose, answer.map_index, -1),
+        pose=jnp.where(has_pose, answer.pose, 0.0),
         has_pose=has_pose,
         signals=values,
     )
@@ -312,6 +354,7 @@ def step(
         pose=pose,
         was_established=was_established,
         is_lost=is_lost,
+        joint=joint,
     )
     return state, record
 
@@ -331,5 +374,5 @@ def replay(
     Returns:
         The final state and one record per frame, the same as from single steps.
     """
-    start = init(config) if state is None else state
+    start = init(config, tables) if state is None else state
     return jax.lax.scan(lambda carry, frame: step(config, tables, carry, frame), start, frames)

@@ -1,0 +1,162 @@
+"""The joint branches of a stream: what is remembered, and one frame's work."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from taojax.config import StreamConfig
+from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch, pool
+from taojax.core.se2 import compose, inverse
+from taojax.runtime.maps import MapTables
+from taojax.runtime.scale import ScaleState, init_scale, rescale
+
+GAMMA = 1.0
+"""Cost of background similarity and of no support, the unit of the joint objective."""
+
+DISTINCT_DELTAS = 3.0
+"""Two branches are rivals, not one, when their poses lie farther apart than this."""
+
+
+class JointState(eqx.Module):
+    """Memory of the joint branches: rings of fixed shape, addressed by `slot`."""
+
+    p: Float[Array, "n 3"]
+    """Local poses; the newest is the origin."""
+
+    rows: Float[Array, "n m"]
+    """Similarity of every anchor, on the fixed scale."""
+
+    pooled: Int[Array, "n m"]
+    """Best anchor around every anchor."""
+
+    is_filled: Bool[Array, " n"]
+    slot: Int[Array, ""]
+    """Where the next frame goes."""
+
+    carried: Float[Array, "3"]
+    """Pose of the last best branch: one more seed, so that a frame whose candidates all miss the
+    place does not break the branch."""
+
+    has_carried: Bool[Array, ""]
+    scale: ScaleState
+
+
+class JointReading(eqx.Module):
+    """What one frame says."""
+
+    best: JointBranch
+    """The cheapest branch; frames in time order, newest last."""
+
+    rival: Float[Array, ""]
+    """Cost of the cheapest branch somewhere else."""
+
+    is_filled: Bool[Array, " n"]
+    """In time order."""
+
+    p: Float[Array, "n 2"]
+    """Local positions in time order."""
+
+
+def init_joint(config: StreamConfig, n_anchors: int) -> JointState:
+    """Return the memory before the first frame."""
+    n = config.joint_window
+    return JointState(
+        p=jnp.zeros((n, 3)),
+        rows=jnp.zeros((n, n_anchors)),
+        pooled=jnp.zeros((n, n_anchors), jnp.int32),
+        is_filled=jnp.zeros(n, bool),
+        slot=jnp.zeros((), jnp.int32),
+        carried=jnp.zeros(3),
+        has_carried=jnp.zeros((), bool),
+        scale=init_scale(),
+    )
+
+
+def joint_params(config: StreamConfig, tables: MapTables) -> JointParams:
+    """Return the weights of the joint objective with length scales in metres of this map."""
+    delta_m = config.delta_spacings * tables.spacing_m
+    return JointParams(
+        delta_m=delta_m,
+        gamma=GAMMA,
+        kappa=config.kappa_spacings * (tables.spacing_m / delta_m) ** 2,
+    )
+
+
+def _seeds(
+    config: StreamConfig, tables: MapTables, index: Int[Array, " c"], carried: Float[Array, "3"]
+) -> Float[Array, "s 3"]:
+    """Return the newest candidates' map poses in both travel directions, and the carried pose."""
+    row = jnp.maximum(index[: config.joint_seeds], 0)
+    theta = tables.grid.theta[row]
+    ahead = jnp.concatenate([tables.grid.xy[row], theta[:, None]], axis=1)
+    back = jnp.concatenate([tables.grid.xy[row], theta[:, None] + jnp.pi], axis=1)
+    return jnp.concatenate([ahead, back, carried[None]])
+
+
+def joint_step(
+    config: StreamConfig,
+    tables: MapTables,
+    state: JointState,
+    odometry: Float[Array, "3"],
+    index: Int[Array, " c"],
+    row: Float[Array, " m"],
+) -> tuple[JointState, JointReading]:
+    """Advance all joint branches by one frame.
+
+    Args:
+        config: settings.
+        tables: the map.
+        state: memory.
+        odometry: motion into this frame, finite.
+        index: `(c,)` candidates, best first, -1 = none.
+        row: `(m,)` raw similarity of every anchor; NaN = not among the candidates.
+
+    Returns:
+        The memory and the reading.
+    """
+    n, params = config.joint_window, joint_params(config, tables)
+    scale, scaled = rescale(state.scale, tables.scale, row)
+    slot = state.slot
+    motion = jnp.broadcast_to(inverse(odometry), state.p.shape)
+    p = compose(motion, state.p).at[slot].set(0.0)
+    rows = state.rows.at[slot].set(scaled)
+    pooled = state.pooled.at[slot].set(pool(tables.grid, GAMMA, scaled))
+    is_filled = state.is_filled.at[slot].set(True)
+    age = jnp.mod(slot - jnp.arange(n), n)
+    decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
+    window = JointWindow(p[:, :2], decay / jnp.sum(decay), rows, pooled)
+
+    carried = compose(state.carried, odometry)
+    seeds = _seeds(config, tables, index, carried)
+    n_lists = min(config.joint_seeds, index.shape[0])
+    is_seed = index[:n_lists] >= 0
+    # Without any candidate and history the first anchor is as good a guess as any.
+    is_live = jnp.concatenate([is_seed, is_seed, state.has_carried[None]])
+    branches = jax.vmap(joint_branch, in_axes=(None, None, None, 0))(
+        params, tables.grid, window, seeds
+    )
+    cost = jnp.where(is_live | ~jnp.any(is_live), branches.cost, jnp.inf)
+    winner = jnp.argmin(cost)
+    best: JointBranch = jax.tree.map(lambda leaf: leaf[winner], branches)
+    gap = branches.T_map_odom[:, :2] - best.T_map_odom[None, :2]
+    is_elsewhere = jnp.sum(gap**2, axis=1) > (DISTINCT_DELTAS * params.delta_m) ** 2
+    rival = jnp.minimum(GAMMA, jnp.min(jnp.where(is_elsewhere, cost, GAMMA)))
+
+    order = jnp.argsort(age)[::-1]
+    in_time = eqx.tree_at(
+        lambda b: (b.anchor, b.frame_cost, b.is_inlier),
+        best,
+        (best.anchor[order], best.frame_cost[order], best.is_inlier[order]),
+    )
+    state = JointState(
+        p=p,
+        rows=rows,
+        pooled=pooled,
+        is_filled=is_filled,
+        slot=jnp.mod(slot + 1, n),
+        carried=best.T_map_odom,
+        has_carried=state.has_carried | jnp.any(is_seed),
+        scale=scale,
+    )
+    return state, JointReading(in_time, rival, is_filled[order], p[order, :2])
