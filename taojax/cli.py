@@ -95,6 +95,9 @@ class Score(Common):
     dataset: Dataset = tyro.MISSING
     """Data folder, laid out as data_specs/README.md says."""
 
+    calibration: Annotated[Path | None, _flag("FILE.toml", "no verdicts at run time")] = None
+    """calibration.toml of an audited run: adds decisions.csv, verdicts at frozen numbers."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate(Common):
@@ -174,11 +177,13 @@ def _score_apart(dataset: Path, out: Path, config: "Config", *, progress: bool) 
 
 
 def _score(args: Score) -> None:
+    from taojax.detector import from_toml
     from taojax.runtime.score import score
 
     config = _config(args)
     out = _out(args, "score", config)
-    manifest = score(args.dataset, out, config, progress=args.progress)
+    detector = None if args.calibration is None else from_toml(args.calibration)
+    manifest = score(args.dataset, out, config, detector=detector, progress=args.progress)
     _say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
 
 

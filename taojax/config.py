@@ -53,13 +53,13 @@ class StreamConfig(eqx.Module):
     mask_deltas: Scalar = 3.0
     """Residual mask as a multiple of the Huber threshold, > 0."""
 
-    joint_window: int = eqx.field(static=True, default=40)
+    joint_window: int = eqx.field(static=True, default=60)
     """*shape*. Frames that a joint branch remembers, at least 3; older ones weigh less anyway."""
 
-    joint_seeds: int = eqx.field(static=True, default=30)
+    joint_seeds: int = eqx.field(static=True, default=15)
     """*shape*. Newest candidates that seed a joint branch, each in both travel directions."""
 
-    memory_frames: Scalar = 10.0
+    memory_frames: Scalar = 20.0
     """Age at which a frame's weight in the joint cost has fallen to 1/e, frames, > 0."""
 
     kappa_spacings: Scalar = 1.25
@@ -101,6 +101,12 @@ class AuditConfig(eqx.Module):
     sigmas: float = 3.0
     """The paper's rule: threshold = mean + sigmas * standard deviation of in-map costs."""
 
+    alpha: float = 0.2
+    """False acceptance rate that the conformal threshold promises at most, in (0, 1)."""
+
+    confidence: float = 0.9
+    """Share of recordings in which that promise holds, at least, in (0, 1)."""
+
     n_bootstrap: int = 300
     """Block-bootstrap resamples behind each interval, at least 10."""
 
@@ -115,6 +121,8 @@ class AuditConfig(eqx.Module):
             raise ConfigError(f"r_out_m ({self.r_out_m}) must be >= r_in_m ({self.r_in_m})")
         _check_range("calibration_share", self.calibration_share, 0.01, 0.99)
         _check_range("sigmas", self.sigmas, 0.0)
+        _check_range("alpha", self.alpha, 1e-6, 1.0)
+        _check_range("confidence", self.confidence, 1e-6, 1.0)
         _check_range("n_bootstrap", self.n_bootstrap, 10, 100_001)
         _check_range("block_frames", self.block_frames, 1)
 

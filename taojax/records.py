@@ -119,6 +119,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     similarity: np.ndarray,
     config_toml: str,
     manifest: Mapping[str, Any],
+    decisions: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, Any]:
     """Seal one run.
 
@@ -130,6 +131,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
         similarity: (T, 100).
         config_toml: resolved settings.
         manifest: facts about the run; `sha256` may already hold hashes of the inputs.
+        decisions: columns of data_specs/decisions.toml where a calibration was carried along.
 
     Returns:
         The manifest as sealed.
@@ -147,6 +149,8 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
         "retrievals.npz": archive.getvalue(),
         "signals.csv": table_text("signals", signals).encode(),
     }
+    if decisions is not None:
+        files["decisions.csv"] = table_text("decisions", decisions).encode()
     hashes = dict(manifest.get("sha256", {})) | {name: digest(raw) for name, raw in files.items()}
     sealed = {"schema": SCHEMA, **manifest, "sha256": hashes}
     sealed["seal"] = _seal(sealed)
@@ -183,7 +187,8 @@ def read_run(run: Path) -> Run:
         InputError: a sealed file is missing, changed or malformed.
     """
     manifest = read_manifest(run)
-    for name in SEALED:
+    carried = [name for name in ("decisions.csv",) if name in manifest["sha256"]]
+    for name in (*SEALED, *carried):
         want, got = manifest["sha256"].get(name), digest_file(run / name)
         if got != want:
             what = f"seal broken: sha256 {got[:12]}... is not {str(want)[:12]}..."

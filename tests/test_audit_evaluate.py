@@ -16,8 +16,8 @@ from taojax.errors import InputError
 from taojax.specs import read_table
 
 FILES = {
-    "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "report.html",
-    *(f"tables/{n}.{e}" for n in ("metrics", "recall", "micro", "errors")
+    "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "calibration.toml", "report.html",
+    *(f"tables/{n}.{e}" for n in ("metrics", "recall", "micro", "errors", "conformal")
       for e in ("csv", "md", "tex")),
     *(f"figures/{n}.{e}" for n in ("map", "diagnostics", "roc", "pr", "reliability", "retrieval")
       for e in ("png", "svg", "csv")),

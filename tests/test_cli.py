@@ -102,6 +102,24 @@ def test_audit_leaves_every_file_of_the_contract(data_folder, tmp_path, capfd):
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
+def test_a_calibration_file_carries_the_verdicts_to_run_time(data_folder, tmp_path, capfd):
+    audited, scored = tmp_path / "audited", tmp_path / "scored"
+    words = ["--out", str(audited), "--r-in", "3", "--r-out", "6", *FLAGS]
+    assert main(["audit", str(data_folder), *words]) == 0
+    carried = ["--calibration", str(audited / "calibration.toml"), "--out", str(scored), *FLAGS]
+    assert main(["score", str(data_folder), *carried]) == 0
+    judged = [row.split(",") for row in (audited / "verdicts.csv").read_text().splitlines()[1:]]
+    decided = [row.split(",") for row in (scored / "decisions.csv").read_text().splitlines()[1:]]
+    assert [row[1] for row in decided] == [row[1] for row in judged]
+    assert [float(r[2]) for r in decided] == pytest.approx([float(r[2]) for r in judged], abs=1e-6)
+    raw = bytearray((scored / "decisions.csv").read_bytes())
+    raw[-3] ^= 1
+    (scored / "decisions.csv").write_bytes(raw)
+    truth = str(data_folder / "truth")
+    assert main(["evaluate", str(scored), "--truth", truth]) == 3
+    assert "decisions.csv: seal broken" in capfd.readouterr().err
+
+
 def test_a_broken_seal_is_exit_3_with_one_line(data_folder, tmp_path, capsys):
     out = tmp_path / "run"
     assert main(["score", str(data_folder), "--out", str(out), *FLAGS]) == 0

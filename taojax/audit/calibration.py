@@ -7,140 +7,132 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.audit.labels import CalibrationSplit
+from taojax.detector import Detector, probability
 
-FEATURES = (
-    "top1", "top1_w10", "margin", "entropy", "velocity", "sue",
-    "tao_rank", "tao_rank_geom", "tao_rank_vel", "support", "h_proxy", "tao",
-)  # fmt: skip
-"""What the logistic model sees: the frontend, then the backend."""
+PRIOR = {
+    "top1_w5": 0.45,
+    "tao": 0.9,
+    "tao_window": 0.6,
+    "recursive": 0.65,
+    "tao_rival": -0.3,
+}
+"""Signal -> log odds per standard deviation before any label is seen. Similarity level, aligned
+evidence with an adaptive and with a long memory, the recursive filter, and ambiguity: several
+equally good places speak for being off the map."""
 
+PRIOR_PRECISION = 10.0
+"""How firmly the weights hold to the prior; one labelled effective frame weighs about 1/4."""
+
+CORRELATED_FRAMES = 8.0
+"""Neighbouring frames repeat each other: so many count as one."""
+
+MOST_EFFECTIVE = 40.0
+"""Effective frames of a class at most, so that a long standstill does not outvote the prior."""
+
+ACCEPTED_SHARE = 0.95
+"""In-map calibration frames that the detector's threshold accepts."""
+
+_TINY = 1e-9  # below it a signal is constant and says nothing
 LEAST_PER_CLASS = 5
-"""Frames of each class below which no two-class model is fitted."""
-
-_INVERSE_PENALTY = 0.01  # scikit-learn's C: neighbouring frames are worth far less than one each
-_CLIP_SD = 4.0  # one wild residual must not outvote everything else
-_TINY = 1e-9  # keeps log odds finite
+"""Frames of each class below which the model is called a fallback."""
 
 
-class Logistic(NamedTuple):
-    """A linear model of the log odds of being map-out."""
-
-    mean: Float[np.ndarray, " f"]
-    scale: Float[np.ndarray, " f"]
-    weight: Float[np.ndarray, " f"]
-    """Per standardised feature."""
-
-    bias: float
-    note: str
-
-
-class Ranked(NamedTuple):
-    """The fallback: where does `tao` rank among the in-map calibration frames?"""
-
-    tao: Float[np.ndarray, " n"]
-    """Ascending; empty when not even the fallback is possible."""
-
-    note: str
-
-
-def _table(signals: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n f"]:
-    return np.stack([np.asarray(signals[name], dtype=float) for name in FEATURES], axis=1)
-
-
-def _standardise(
-    x: Float[np.ndarray, "n f"], mean: Float[np.ndarray, " f"], scale: Float[np.ndarray, " f"]
-) -> Float[np.ndarray, "n f"]:
-    return np.clip((x - mean[None]) / scale[None], -_CLIP_SD, _CLIP_SD)
-
-
-def fit(calibration: CalibrationSplit) -> Logistic | Ranked:
-    """Fit the probability of being map-out.
-
-    Classes are balanced while the weights are fitted, so that a rare class is not ignored; the
-    calibration prior, smoothed by one frame of each class, is put back into the bias.
-
-    Args:
-        calibration: labelled frames; grey ones are ignored.
-
-    Returns:
-        A logistic model, or the fallback where a class has fewer than `LEAST_PER_CLASS` frames.
-    """
-    n_in, n_out = int(calibration.is_in.sum()), int(calibration.is_out.sum())
-    if min(n_in, n_out) < LEAST_PER_CLASS:
-        counts = f"the calibration split holds {n_in} in-map and {n_out} map-out frames"
-        if n_in == 0:
-            note = (
-                f"No probability is given, because {counts}: nothing says what in-map looks like."
-            )
-        else:
-            note = (
-                f"The probability is a fallback, because {counts} and a two-class model needs at "
-                f"least {LEAST_PER_CLASS} of each: it is the share of in-map calibration frames "
-                "whose tao is lower. It ranks frames; it is not a calibrated probability."
-            )
-        return Ranked(np.sort(calibration.signals["tao"][calibration.is_in]), note)
-    from sklearn.linear_model import LogisticRegression
-
-    known = calibration.is_in | calibration.is_out
-    x, y = _table(calibration.signals)[known], calibration.is_out[known]
-    mean, spread = x.mean(axis=0), x.std(axis=0)
-    scale = np.where(spread > 0, spread, 1.0)
-    model = LogisticRegression(C=_INVERSE_PENALTY, class_weight="balanced", max_iter=1000)
-    model.fit(_standardise(x, mean, scale), y)
-    prior_log_odds = np.log((n_out + 1) / (n_in + 1))
-    bias = float(np.ravel(model.intercept_)[0] + prior_log_odds)
-    note = (
-        f"The probability is a logistic model over {len(FEATURES)} signals, fitted on {n_in} "
-        f"in-map and {n_out} map-out calibration frames."
+def _note(n_in: int, n_out: int) -> str:
+    counts = f"{n_in} in-map and {n_out} map-out calibration frames"
+    if min(n_in, n_out) >= LEAST_PER_CLASS:
+        return (
+            f"The probability is a logistic model over {len(PRIOR)} signals, shrunk to a fixed "
+            f"prior and fitted on {counts}."
+        )
+    return (
+        f"The probability is a fallback, because there are only {counts} and two classes of at "
+        f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the fixed prior's, so "
+        "it ranks frames, but its level is not calibrated."
     )
-    return Logistic(mean, scale, model.coef_[0], bias, note)
 
 
-def predict(model: Logistic | Ranked, signals: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
-    """Return the probability of being map-out, frame by frame; no frame sees another.
+def fit(calibration: CalibrationSplit) -> Detector:
+    """Fit the probability of being map-out: logistic, shrunk to a fixed prior.
+
+    Location and scale of each signal come from all calibration frames, labelled or not; with one
+    class, or a handful of frames, the prior decides.
 
     Args:
-        model: from `fit`.
-        signals: signal -> (t,).
+        calibration: frames that may be fitted on; grey ones give scale but no label.
 
     Returns:
-        In (0, 1), or NaN on every frame where the calibration split had no in-map frame.
+        The detector. Its threshold is the level that accepts 95 % of the in-map calibration
+        frames; NaN where there is none.
     """
-    if isinstance(model, Ranked):
-        n = len(model.tao)
-        if n == 0:
-            return np.full(len(signals["tao"]), np.nan)
-        below = np.searchsorted(model.tao, signals["tao"], side="left")
-        return (below + 0.5) / (n + 1.0)
-    # Summed by hand: a matrix product may round differently for other numbers of frames.
-    z = _standardise(_table(signals), model.mean, model.scale)
-    log_odds = np.sum(z * model.weight[None], axis=1) + model.bias
-    return 1.0 / (1.0 + np.exp(-log_odds))
+    from scipy.optimize import minimize
+
+    x = np.stack([np.asarray(calibration.signals[name], float) for name in PRIOR], axis=1)
+    mean, spread = x.mean(axis=0), x.std(axis=0)
+    scale = np.where(spread > _TINY, spread, 1.0)
+    known = calibration.is_in | calibration.is_out
+    z, y = ((x - mean) / scale)[known], calibration.is_out[known].astype(float)
+    counts = np.array([(y == 0).sum(), (y == 1).sum()])
+    effective = np.minimum(MOST_EFFECTIVE, counts / CORRELATED_FRAMES) / np.maximum(counts, 1)
+    frame_weight = effective[y.astype(int)]
+    prior = np.array(list(PRIOR.values()))
+
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        weight, bias = parameters[:-1], parameters[-1]
+        log_odds = np.sum(z * weight[None], axis=1) + bias
+        surprise = frame_weight * (np.logaddexp(0.0, log_odds) - y * log_odds)
+        residual = frame_weight * (1.0 / (1.0 + np.exp(-log_odds)) - y)
+        pull = weight - prior
+        value = surprise.sum() + 0.5 * PRIOR_PRECISION * np.sum(pull**2) + 0.005 * bias**2
+        slope = np.sum(residual[:, None] * z, axis=0) + PRIOR_PRECISION * pull
+        return float(value), np.append(slope, residual.sum() + 0.01 * bias)
+
+    best = minimize(loss, np.append(prior, 0.0), jac=True, method="L-BFGS-B").x
+    detector = Detector(
+        columns=tuple(PRIOR),
+        mean=mean,
+        scale=scale,
+        weight=best[:-1],
+        bias=float(best[-1]),
+        threshold=float("nan"),
+        note=_note(int(counts[0]), int(counts[1])),
+    )
+    inside = probability(detector, calibration.signals)[calibration.is_in]
+    return detector._replace(threshold=_accepting(inside))
+
+
+def _accepting(inside: Float[np.ndarray, " n"]) -> float:
+    """Return the first level that accepts the wanted share of in-map frames; NaN without any."""
+    if not inside.size or np.isnan(inside).any():
+        return float("nan")
+    return float(np.sort(inside)[int(np.ceil(ACCEPTED_SHARE * len(inside))) - 1])
+
+
+def predict(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
+    """Return the probability of being map-out, in (0, 1), frame by frame."""
+    return probability(detector, signals)
 
 
 def sigma_threshold(
     calibration: CalibrationSplit, name: str, sigmas: float, *, is_probability: bool = False
 ) -> float:
-    """Return the paper's threshold: mean + sigmas x standard deviation of in-map frames.
+    """Return a signal's frozen threshold: mean + sigmas x standard deviation of in-map frames.
 
     Args:
         calibration: frames that may be fitted on.
         name: the signal.
         sigmas: the paper's 3.
-        is_probability: apply the rule to the log odds, where it cannot leave (0, 1).
+        is_probability: a mean and a deviation mean little for a probability; take the level that
+            accepts 95 % of the in-map frames instead.
 
     Returns:
-        The threshold (population standard deviation), or NaN without an in-map frame. That of
-        `fused` rests on frames its model was fitted on, so its in-map spread is flattering.
+        The threshold (population standard deviation), or NaN without an in-map frame.
     """
     inside = np.asarray(calibration.signals[name], dtype=float)[calibration.is_in]
+    if is_probability:
+        return _accepting(inside)
     if not inside.size or np.isnan(inside).any():
         return float("nan")
-    if not is_probability:
-        return float(inside.mean() + sigmas * inside.std())
-    p = np.clip(inside, _TINY, 1.0 - _TINY)
-    log_odds = np.log(p / (1.0 - p))
-    return float(1.0 / (1.0 + np.exp(-(log_odds.mean() + sigmas * log_odds.std()))))
+    return float(inside.mean() + sigmas * inside.std())
 
 
 class Reliability(NamedTuple):

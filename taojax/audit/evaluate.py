@@ -4,11 +4,14 @@ import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
+
 from taojax.audit import figures, report, tables
 from taojax.audit.judgement import Evaluation, Judgement, judge
 from taojax.audit.truth import Truth, read_truth
 from taojax.audit.words import find_words, terminal_table
 from taojax.config import Config
+from taojax.detector import to_toml
 from taojax.records import read_run
 from taojax.specs import table_text, write_atomically
 
@@ -32,7 +35,7 @@ def _settings(judgement: Judgement, truth: Truth) -> str:
         "gap_frames": judgement.config.stream.window,
         "seed": judgement.config.seed,
         "audit": {f.name: getattr(audit, f.name) for f in dataclasses.fields(audit)},
-        "probability": judgement.model_note,
+        "probability": judgement.detector.note,
     }
     return json.dumps(facts, indent=2) + "\n"
 
@@ -73,7 +76,9 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
         "metrics.csv": table_text("metrics", judgement.metrics),
         "audit.json": _settings(judgement, known),
     }
-    for name in ("metrics", "recall", "micro", "errors"):
+    if not np.isnan(judgement.detector.threshold):
+        files["calibration.toml"] = to_toml(judgement.detector)
+    for name in ("metrics", "recall", "micro", "errors", "conformal"):
         files |= tables.as_files(name, getattr(judgement, name))
     for drawn in pictures:
         files |= figures.as_files(drawn)

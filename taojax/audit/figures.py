@@ -190,7 +190,7 @@ def reliability(judgement: Judgement) -> tuple[Picture, ...]:
         bins.promised, bins.realised, bins.n_frames, ax=figure.subplots()
     )  # fmt: skip
     csv = csv_text({"promised": bins.promised, "realised": bins.realised, "n": bins.n_frames})
-    caption = f"Test split, n = {int(known.sum())}. {judgement.model_note}"
+    caption = f"Test split, n = {int(known.sum())}. {judgement.detector.note}"
     return (picture(figure, "reliability", "Reliability of the probability", caption, csv),)
 
 

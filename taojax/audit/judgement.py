@@ -7,9 +7,11 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from taojax.audit import calibration, labels, metrics, tables
+from taojax.audit.conformal import Promise, conformal_threshold
 from taojax.audit.truth import Truth
 from taojax.audit.verdicts import decide
 from taojax.config import Config
+from taojax.detector import Detector
 from taojax.records import Run, signal_names
 
 
@@ -46,8 +48,12 @@ class Judgement(NamedTuple):
     recall: tables.Table
     micro: tables.Table
     errors: tables.Table
-    model_note: str
-    """How the probability was made, in words."""
+    conformal: tables.Table
+    promise: Promise
+    """What the conformal rule promises for tao."""
+
+    detector: Detector
+    """The frozen numbers behind the probability."""
 
     clock_gap_s: float
     """Largest difference between the time stamps of run and truth."""
@@ -90,7 +96,7 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     with_fused = signals | {tables.FUSED: probability}
     splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)
 
-    verdicts = decide(run.signals, splits.calibration, probability, audit.sigmas)
+    verdicts = decide(run.signals, splits.calibration, model)
     error = np.hypot(run.signals["x_m"] - truth.xy_m[:, 0], run.signals["y_m"] - truth.xy_m[:, 1])
     inside, test = label == "in_map", splits.name == "test"
     accepted = verdicts["verdict"] == "accept"
@@ -117,8 +123,16 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         metrics=tables.metrics_table(signals, label, splits, audit, config.seed),
         recall=tables.recall_table(curves, nearest),
         micro=tables.micro_table(signals, nearest, audit, config.seed),
+        conformal=tables.conformal_table(tuple(signals), splits, audit),
+        promise=conformal_threshold(
+            splits.calibration,
+            "tao",
+            alpha=audit.alpha,
+            confidence=audit.confidence,
+            block_frames=audit.block_frames,
+        ),
         errors=tables.errors_table(error, groups, 2 * audit.r_in_m),
-        model_note=model.note,
+        detector=model,
         clock_gap_s=float(np.max(np.abs(truth.t_s - run.signals["t_s"]))),
     )
 

@@ -36,20 +36,23 @@ def _big(value: float) -> str:
 
 def _cards(judgement: Judgement) -> list[Cell]:
     """Return the numbers of the first screen."""
-    test, row = judgement.splits.test.frame, metric_row(judgement, "tao")
+    test, row = judgement.splits.test.frame, metric_row(judgement, "fused")
+    tao = metric_row(judgement, "tao")
     verdict = judgement.verdicts["verdict"][test]
     cards = [
         Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", "verdicts.csv")
         for word, said in (("accept", "accepted"), ("reject", "rejected"), ("abstain", "abstained"))
     ]
-    far = f"FAR of tao, {span(row, 'far')}, n = {row['n_out_test']:.0f} map-out frames"
-    frr = f"FRR of tao, {span(row, 'frr')}, n = {row['n_in_test']:.0f} in-map frames"
-    auroc = f"AUROC of tao, {span(row, 'auroc')}, prevalence {row['prevalence']:.2f}"
+    far = (
+        f"FAR of the verdict's rule, {span(row, 'far')}, n = {row['n_out_test']:.0f} map-out frames"
+    )
+    frr = f"FRR of the verdict's rule, {span(row, 'frr')}, n = {row['n_in_test']:.0f} in-map frames"
+    auroc = f"AUROC of tao, {span(tao, 'auroc')}, prevalence {tao['prevalence']:.2f}"
     return [
         *cards,
         Cell(_big(row["far"]), far, _about("far")),
         Cell(_big(row["frr"]), frr, _about("frr")),
-        Cell(_big(row["auroc"]), auroc, _about("auroc")),
+        Cell(_big(tao["auroc"]), auroc, _about("auroc")),
     ]
 
 
@@ -99,6 +102,7 @@ def _run_grids(judgement: Judgement) -> list[Grid]:
         grid("metrics", table, title="At the frozen threshold, on the test split", columns=_FROZEN),
         grid("metrics", runtime, title="Separation over all labelled frames", columns=_ALL_FRAMES),
         grid("metrics", table, title="Separation on the test split", columns=_TEST),
+        grid("conformal", judgement.conformal, title="Promised false acceptance rate"),
         *_micro_grids(judgement.micro),
         grid("metrics", probability, title="Calibrated probability", columns=scores),
     ]
@@ -131,11 +135,11 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
 def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> list[str]:
     said = []
     for name, done in summary.cut_maps(scenarios).items():
-        tao, top1 = (metric_row(done.judgement, signal) for signal in ("tao", "top1"))
+        tao, top1, fused = (metric_row(done.judgement, s) for s in ("tao", "top1", "fused"))
         said.append(
             f"{name}: {int(tao['n_out'])} of {len(done.judgement.label)} queries are off the map. "
             f"AUROC: tao {rate(tao, 'auroc')}, best similarity {rate(top1, 'auroc')}. False "
-            f"acceptance at the frozen threshold: tao {rate(tao, 'far')}, best similarity "
+            f"acceptance at the frozen threshold: verdicts {rate(fused, 'far')}, best similarity "
             f"{rate(top1, 'far')} (n = {int(tao['n_out_test'])})."
         )
     micro = base.judgement.micro
@@ -159,16 +163,19 @@ def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> lis
 
 
 def _mapout_columns(key: str) -> tuple[str, ...]:
-    measured = (f"top1_{key}", f"paper_top1_{key}", f"velocity_{key}", f"tao_{key}")
-    return ("scenario", "map_out_frames", "paper_map_out_frames", *measured, f"paper_tao_{key}")
+    measured = (f"top1_{key}", f"paper_top1_{key}", f"velocity_{key}", f"paper_tao_{key}")
+    ours = (f"tao_rank_{key}", f"tao_{key}", *(["fused_far"] if key == "far" else []))
+    return ("scenario", "map_out_frames", "paper_map_out_frames", *measured, *ours)
 
 
 def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
     cards = []
     for name, done in summary.cut_maps(scenarios).items():
-        row = metric_row(done.judgement, "tao")
+        row = metric_row(done.judgement, "fused")
         cards.append(
-            Cell(_big(row["far"]), f"{name}: FAR of tao, {span(row, 'far')}", _about("far"))
+            Cell(
+                _big(row["far"]), f"{name}: FAR of the verdicts, {span(row, 'far')}", _about("far")
+            )
         )
     return cards
 

@@ -33,7 +33,7 @@ _PAPER_COLUMNS = (
     "paper_map_out_frames", "paper_top1_auroc", "paper_tao_auroc",
     "paper_top1_far", "paper_tao_far",
 )  # fmt: skip
-_COMPARED = ("top1", "velocity", "tao")
+_COMPARED = ("top1", "velocity", "tao_rank", "tao")
 
 
 def cut_maps(scenarios: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
@@ -53,6 +53,7 @@ def mapout_table(scenarios: Mapping[str, Evaluation]) -> Table:
         for signal in _COMPARED:
             measured = metric_row(done.judgement, signal)
             row |= {f"{signal}_{key}": measured[key] for key in ("auroc", "far")}
+        row["fused_far"] = metric_row(done.judgement, "fused")["far"]
         if name in PAPER_TABLE_2:
             row |= dict(zip(_PAPER_COLUMNS, PAPER_TABLE_2[name], strict=True))
         rows.append(row)
@@ -80,7 +81,7 @@ def joined_metrics(scenarios: Mapping[str, Evaluation]) -> str:
 
 
 def compare(scenarios: Mapping[str, Evaluation]) -> Picture:
-    """Draw AUROC and FAR of the three gates per scenario, the paper's figures beside ours."""
+    """Draw AUROC and FAR of the gates per scenario, the paper's figures beside ours."""
     cut = cut_maps(scenarios)
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     columns = {"scenario": np.array([name for name in cut for _ in _COMPARED])}
@@ -95,7 +96,7 @@ def compare(scenarios: Mapping[str, Evaluation]) -> Picture:
             names = (key, f"{key}_lo", f"{key}_hi")
             groups[signal] = np.array([[row[n] for n in names] for row in rows], dtype=float)
         paper = np.array([PAPER_TABLE_2.get(name, (np.nan,) * 5) for name in cut], dtype=float)
-        reference = {"top1": paper[:, at[0]], "tao": paper[:, at[1]]}
+        reference = {"top1": paper[:, at[0]], "tao_rank": paper[:, at[1]]}
         plots.scenario_dots(groups, tuple(cut), reference=reference, label=label, ax=ax)
         stacked = np.stack([groups[signal] for signal in _COMPARED], axis=1).reshape(-1, 3)
         columns |= {f"{key}{end}": stacked[:, i] for i, end in enumerate(("", "_lo", "_hi"))}

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from taojax.audit import bootstrap, calibration, metrics
+from taojax.audit.conformal import conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.audit.verdicts import plain
 from taojax.config import AuditConfig
@@ -157,6 +158,39 @@ def metrics_table(
         row |= operating_row(test, name, threshold, held)
         rows.append(row | (probability_row(test, held) if name == FUSED else {}))
     return from_rows("metrics", rows)
+
+
+def conformal_table(names: Sequence[str], splits: Splits, config: AuditConfig) -> Table:
+    """Promise a false acceptance rate for every signal, and say what came of it on the test split.
+
+    Args:
+        names: signals, the fitted probability not among them.
+        splits: calibration frames make the promise, test frames keep it or not.
+        config: alpha, confidence and block length.
+    """
+    rows = []
+    for name in names:
+        promise = conformal_threshold(
+            splits.calibration,
+            name,
+            alpha=config.alpha,
+            confidence=config.confidence,
+            block_frames=config.block_frames,
+        )
+        is_promised = np.isfinite(promise.threshold)
+        rows.append(
+            {
+                "signal": name,
+                "alpha": promise.alpha,
+                "confidence": promise.confidence,
+                "block_frames": config.block_frames,
+                "n_blocks": promise.n_blocks,
+                "least_alpha": promise.least_alpha,
+                "threshold": promise.threshold if is_promised else NAN,
+                "far": realised(splits.test, name, promise) if is_promised else NAN,
+            }
+        )
+    return from_rows("conformal", rows)
 
 
 def micro_table(

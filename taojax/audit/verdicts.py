@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
 
-from taojax.audit.calibration import sigma_threshold
 from taojax.audit.labels import CalibrationSplit
+from taojax.detector import Detector, log_odds_terms, probability
 
 ABSTAIN = {
     "warming_up": "warming_up: fewer than three frames seen",
@@ -16,73 +15,62 @@ ABSTAIN = {
 }
 """Statuses in which nothing is decided."""
 
-_TERMS = {"tao_geom": "residual", "tao_vel": "velocity", "tao_sim": "similarity"}
-
 
 def plain(value: float) -> str:
     """Return four significant digits without an exponent, for people."""
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 
-def _loudest_term(
-    signals: Mapping[str, np.ndarray], calibration: CalibrationSplit
-) -> tuple[list[str], Float[np.ndarray, " t"]]:
-    """Name, per frame, the term of tao that lies farthest above its mean in-map level."""
-    excess = np.stack(
-        [signals[name] - np.mean(calibration.signals[name][calibration.is_in]) for name in _TERMS],
-        axis=1,
-    )
+def _loudest(
+    detector: Detector, signals: Mapping[str, np.ndarray], calibration: CalibrationSplit
+) -> list[str]:
+    """Say, per frame, which signal speaks most for being off the map, against its in-map level."""
+    inside = {name: calibration.signals[name][calibration.is_in] for name in detector.columns}
+    level = log_odds_terms(detector, inside).mean(axis=0, keepdims=True)
+    excess = log_odds_terms(detector, signals) - level
     loudest = np.argmax(excess, axis=1)
-    names = list(_TERMS)
-    return [names[i] for i in loudest], excess[np.arange(len(loudest)), loudest]
-
-
-def _describe(term: str, excess: float) -> str:
-    if excess <= 0:
-        return "no term lies above its in-map mean"
-    return f"most of it from {term} ({_TERMS[term]}): {plain(excess)} above its in-map mean"
+    said = []
+    for row, column in zip(excess, loudest, strict=True):
+        name = detector.columns[column]
+        if row[column] <= 0:
+            said.append("no signal lies above its in-map mean")
+        else:
+            said.append(f"most of it from {name}: {plain(row[column])} log odds above in-map")
+    return said
 
 
 def decide(
-    signals: Mapping[str, np.ndarray],
-    calibration: CalibrationSplit,
-    probability: Float[np.ndarray, " t"],
-    sigmas: float,
+    signals: Mapping[str, np.ndarray], calibration: CalibrationSplit, detector: Detector
 ) -> dict[str, np.ndarray]:
-    """Judge every frame by `tao` at its sigma threshold, the paper's rule.
-
-    The terms of tao add up to it, so their excess over the in-map mean, in units of cost, says
-    which of them carried a frame to where it is.
+    """Judge every frame by its probability at the detector's frozen threshold.
 
     Args:
         signals: the columns of signals.csv, status included.
-        calibration: the frames that the threshold may come from.
-        probability: of being map-out; NaN = unknown.
-        sigmas: the paper's 3.
+        calibration: the frames that the detector was fitted on.
+        detector: from `calibration.fit`.
 
     Returns:
         The columns of verdicts.csv; no reason holds a comma.
     """
-    threshold = sigma_threshold(calibration, "tao", sigmas)
+    threshold, p = detector.threshold, probability(detector, signals)
     blind = np.isnan(threshold)
     no_level = "no in-map frame in the calibration split: no threshold"
-    terms = None if blind else _loudest_term(signals, calibration)
+    loudest = None if blind else _loudest(detector, signals, calibration)
     verdict, reason = [], []
-    for t, (status, tao) in enumerate(zip(signals["status"], signals["tao"], strict=True)):
-        if status in ABSTAIN or terms is None:
+    for t, status in enumerate(signals["status"]):
+        if status in ABSTAIN or loudest is None:
             verdict.append("abstain")
             reason.append(ABSTAIN.get(status, no_level))
             continue
-        is_above = tao > threshold
+        is_above = p[t] > threshold
         verdict.append("reject" if is_above else "accept")
         reason.append(
-            f"tao {plain(tao)} {'exceeds' if is_above else 'is within'} threshold "
-            f"{plain(threshold)} by "
-            f"{plain(abs(tao - threshold))}; {_describe(terms[0][t], terms[1][t])}"
+            f"probability {plain(p[t])} {'exceeds' if is_above else 'is within'} threshold "
+            f"{plain(threshold)} by {plain(abs(p[t] - threshold))}; {loudest[t]}"
         )
     return {
         "frame": signals["frame"],
         "verdict": np.array(verdict, dtype=object),
-        "probability_map_out": probability,
+        "probability_map_out": p,
         "reason": np.array(reason, dtype=object),
     }

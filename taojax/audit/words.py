@@ -54,16 +54,16 @@ def _counts(judgement: Judgement) -> list[str]:
 
 
 def _operating(judgement: Judgement) -> list[str]:
-    row, said = metric_row(judgement, "tao"), []
+    row, said = metric_row(judgement, "fused"), []
     if np.isnan(row["threshold"]):
         return ["The calibration split holds no in-map frame, so there is no threshold."]
     n_in, n_out = int(row["n_in_test"]), int(row["n_out_test"])
-    rule = f"tao <= {plain(row['threshold'])}, frozen on the calibration split"
+    rule = f"probability <= {plain(row['threshold'])}, frozen on the calibration split"
     if n_out:
         passed = round(row["far"] * n_out)
         if row["far"] > _MOST:
             said.append(
-                "At this threshold tao does not protect the map: it accepts most answers "
+                "At this threshold taojax does not protect the map: it accepts most answers "
                 "given off the map."
             )
         said.append(
@@ -173,7 +173,8 @@ def find_words(judgement: Judgement) -> tuple[str, ...]:
     """Return what was found, most important first."""
     parts = (_counts, _operating, _failures, _errors, _separation)
     said = [sentence for part in parts for sentence in part(judgement)]
-    return (*said, judgement.model_note, *_clock(judgement))
+    promised = f"Conformal threshold of tao: {judgement.promise.sentence}"
+    return (*said, judgement.detector.note, promised, *_clock(judgement))
 
 
 def terminal_table(judgement: Judgement) -> str:

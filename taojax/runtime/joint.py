@@ -9,7 +9,6 @@ from taojax.config import StreamConfig
 from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch, pool
 from taojax.core.se2 import compose, inverse
 from taojax.runtime.maps import MapTables
-from taojax.runtime.scale import ScaleState, init_scale, rescale
 
 GAMMA = 1.0
 """Cost of background similarity and of no support, the unit of the joint objective."""
@@ -39,7 +38,6 @@ class JointState(eqx.Module):
     place does not break the branch."""
 
     has_carried: Bool[Array, ""]
-    scale: ScaleState
 
 
 class JointReading(eqx.Module):
@@ -69,7 +67,6 @@ def init_joint(config: StreamConfig, n_anchors: int) -> JointState:
         slot=jnp.zeros((), jnp.int32),
         carried=jnp.zeros(3),
         has_carried=jnp.zeros((), bool),
-        scale=init_scale(),
     )
 
 
@@ -100,7 +97,7 @@ def joint_step(
     state: JointState,
     odometry: Float[Array, "3"],
     index: Int[Array, " c"],
-    row: Float[Array, " m"],
+    scaled: Float[Array, " m"],
 ) -> tuple[JointState, JointReading]:
     """Advance all joint branches by one frame.
 
@@ -110,13 +107,12 @@ def joint_step(
         state: memory.
         odometry: motion into this frame, finite.
         index: `(c,)` candidates, best first, -1 = none.
-        row: `(m,)` raw similarity of every anchor; NaN = not among the candidates.
+        scaled: `(m,)` similarity of every anchor on the fixed scale.
 
     Returns:
         The memory and the reading.
     """
     n, params = config.joint_window, joint_params(config, tables)
-    scale, scaled = rescale(state.scale, tables.scale, row)
     slot = state.slot
     motion = jnp.broadcast_to(inverse(odometry), state.p.shape)
     p = compose(motion, state.p).at[slot].set(0.0)
@@ -157,6 +153,5 @@ def joint_step(
         slot=jnp.mod(slot + 1, n),
         carried=best.T_map_odom,
         has_carried=state.has_carried | jnp.any(is_seed),
-        scale=scale,
     )
     return state, JointReading(in_time, rival, is_filled[order], p[order, :2])

@@ -4,11 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from taojax.config import StreamConfig
 from taojax.core.association import AnchorGrid
-from taojax.runtime.scale import map_scale
+from taojax.runtime.scale import LIST_SCALE, map_scale
 
 NEIGHBOURS = 12
 """Anchors pooled around each anchor."""
@@ -34,7 +34,7 @@ class MapTables(eqx.Module):
     without any candidate."""
 
     scale: Float[Array, "2"]
-    """Background and strong similarity as the map shows them; NaN where it has no descriptors."""
+    """Background and strong similarity."""
 
 
 def map_spacing_m(xy: np.ndarray) -> float:
@@ -56,7 +56,7 @@ def map_spacing_m(xy: np.ndarray) -> float:
 
 def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
     xy = poses[:, :2]
-    tree = cKDTree(xy)
+    tree = KDTree(xy)
     reach = REACH_DELTAS * delta_m
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     cell_m = max(spacing_m, float((high - low).max()) / MAX_CELLS)
@@ -76,6 +76,7 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
         corner=jnp.asarray(low, jnp.float32),
         cell_m=jnp.asarray(cell_m, jnp.float32),
         neighbour=jnp.asarray(neighbour, jnp.int32),
+        neighbour_m2=jnp.asarray(gap**2, jnp.float32),
         neighbour_cost=jnp.asarray(np.where(r <= 1, 0.5 * r**2, r - 0.5), jnp.float32),
     )
 
@@ -88,8 +89,8 @@ def map_tables(
     Args:
         poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
         config: sets the Huber threshold in map spacings; defaults when omitted.
-        descriptors: `(M, D)` of the map images; they fix the similarity scale, which is learnt
-            from past answers when omitted.
+        descriptors: `(M, D)` of the map images; they fix the similarity scale, which is 0 to 1
+            when omitted.
     """
     config = StreamConfig() if config is None else config
     poses = np.asarray(poses, float)
@@ -100,6 +101,6 @@ def map_tables(
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
         extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
         scale=jnp.asarray(
-            [np.nan] * 2 if descriptors is None else map_scale(descriptors), jnp.float32
+            LIST_SCALE if descriptors is None else map_scale(descriptors), jnp.float32
         ),
     )

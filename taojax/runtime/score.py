@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, to_toml
+from taojax.detector import Detector, probability
 from taojax.errors import InputError
 from taojax.records import digest, refuse_if_taken, write_run
 from taojax.runtime.maps import MapTables, map_tables
@@ -111,13 +112,34 @@ def _facts(command: str, dataset: Path, seed: int) -> dict[str, Any]:
     }
 
 
-def score(dataset: Path, out: Path, config: Config, *, progress: bool = False) -> dict[str, Any]:
+def decide(detector: Detector, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the columns of decisions.csv: run-time verdicts at frozen numbers.
+
+    Args:
+        detector: from a calibration file.
+        table: the columns of signals.csv.
+    """
+    p = probability(detector, table)
+    verdict = np.where(p > detector.threshold, "reject", "accept").astype(object)
+    verdict[table["status"] != "ok"] = "abstain"
+    return {"frame": table["frame"], "verdict": verdict, "probability_map_out": p}
+
+
+def score(
+    dataset: Path,
+    out: Path,
+    config: Config,
+    *,
+    detector: Detector | None = None,
+    progress: bool = False,
+) -> dict[str, Any]:
     """Score a data folder and seal the result; needs no truth and never looks for it.
 
     Args:
         dataset: a data folder, laid out as data_specs/README.md says.
         out: run folder to make; must be absent or empty.
         config: settings.
+        detector: frozen numbers of an earlier audit; adds decisions.csv.
         progress: draw a bar on stderr.
 
     Returns:
@@ -135,9 +157,11 @@ def score(dataset: Path, out: Path, config: Config, *, progress: bool = False) -
     frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))
     records = replay_log(config, tables, frames, progress=progress)
     command = " ".join(["taojax", *sys.argv[1:]])
+    table = signal_table(observations.t_s, records)
     return write_run(
         out,
-        signals=signal_table(observations.t_s, records),
+        signals=table,
+        decisions=None if detector is None else decide(detector, table),
         map_poses=observations.map_poses,
         index=index,
         similarity=similarity,

@@ -6,37 +6,38 @@ state, record = step(config, tables, state, frame)    # per frame
 state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.association import look_up
 from taojax.core.cost import (
     Branch,
     BranchCost,
     CostParams,
     branch_cost,
     huber,
-    squared_residuals,
 )
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import compose, inverse
 from taojax.runtime import signals
-from taojax.runtime.joint import JointReading, JointState, init_joint, joint_step
+from taojax.runtime.answer import (
+    FRESH_FRAMES,
+    Established,
+    init_established,
+    joint_answer,
+    joint_terms,
+    rank_answer,
+    watch,
+)
+from taojax.runtime.joint import JointState, init_joint, joint_step
 from taojax.runtime.maps import MapTables
+from taojax.runtime.recursive import RecursiveState, init_recursive, recursive_step
+from taojax.runtime.scale import rescale
 
 STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
 WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
-
-ESTABLISHED_SHARE = 0.5
-"""A branch is established when at least this share of the full window are its inliers."""
-
-FRESH_FRAMES = 3
-"""So many newest inliers in a row, far from the old alignment, are a kidnap."""
 
 
 class Frame(eqx.Module):
@@ -50,6 +51,13 @@ class Frame(eqx.Module):
 
     similarity: Float[Array, "*t c"]
     """Their similarities, at most 1."""
+
+
+class Memory(eqx.Module):
+    """What only joint association remembers."""
+
+    joint: JointState
+    recursive: RecursiveState
 
 
 class StreamState(eqx.Module):
@@ -76,14 +84,9 @@ class StreamState(eqx.Module):
     n_seen: Int[Array, ""]
     """Frames so far; stops counting at the longest window, so that it never wraps."""
 
-    pose: Float[Array, "3"]
-    """Dead-reckoned from the last established alignment; meaningless before the first."""
-
-    was_established: Bool[Array, ""]
-    is_lost: Bool[Array, ""]
-
-    joint: JointState | None
-    """Memory of the joint branches; None where `tao` is the rank cost."""
+    established: Established
+    memory: Memory | None
+    """Of the joint branches; None where `tao` is the rank cost."""
 
 
 class StreamRecord(eqx.Module):
@@ -127,11 +130,14 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
         is_filled=jnp.zeros(n, bool),
         top1=jnp.zeros(max(signals.WINDOWS)),
         n_seen=jnp.zeros((), jnp.int32),
-        pose=jnp.zeros(3),
-        was_established=jnp.zeros((), bool),
-        is_lost=jnp.zeros((), bool),
-        joint=None if config.association == "rank" else init_joint(config, len(tables.grid.xy)),
+        established=init_established(),
+        memory=None if config.association == "rank" else _init_memory(config, tables),
     )
+
+
+def _init_memory(config: StreamConfig, tables: MapTables) -> Memory:
+    m = tables.grid.xy.shape[0]
+    return Memory(init_joint(config, m), init_recursive(m))
 
 
 def _push(window: Array, newest: Array) -> Array:
@@ -156,65 +162,6 @@ def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array
     return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
 
 
-class _Answer(NamedTuple):
-    """What the best branch says of the newest frame, whatever the association."""
-
-    pose: Float[Array, "3"]
-    map_index: Int[Array, ""]
-    share: Float[Array, ""]
-    """Share of the filled window frames that are inliers."""
-
-    is_fresh: Bool[Array, ""]
-    """The newest frames are all inliers."""
-
-    is_degenerate: Bool[Array, ""]
-
-
-def _rank_answer(best: BranchCost, is_filled: Array, map_index: Array) -> _Answer:
-    n_filled = jnp.sum(is_filled.astype(best.geom.dtype))
-    return _Answer(
-        pose=best.T_map_odom,
-        map_index=map_index,
-        share=jnp.sum(best.is_inlier.astype(best.geom.dtype)) / n_filled,
-        is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
-        is_degenerate=best.is_degenerate,
-    )
-
-
-def _joint_answer(tables: MapTables, reading: JointReading) -> _Answer:
-    best = reading.best
-    n_filled = jnp.sum(reading.is_filled.astype(best.cost.dtype))
-    nearest = look_up(tables.grid, best.T_map_odom[None, :2])[0]
-    return _Answer(
-        pose=best.T_map_odom,
-        map_index=jnp.where(best.is_inlier[-1], best.anchor[-1], nearest),
-        share=jnp.sum(best.is_inlier.astype(best.cost.dtype)) / n_filled,
-        is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
-        # The heading prior determines the angle; without any inlier the seed itself is the pose.
-        is_degenerate=jnp.zeros((), bool),
-    )
-
-
-def _joint_terms(
-    config: StreamConfig, delta_m: Array, tables: MapTables, reading: JointReading
-) -> dict[str, Array]:
-    """Return the columns of the joint signal, in units of the Huber threshold squared."""
-    best = reading.best
-    q = tables.grid.xy[jnp.maximum(best.anchor, 0)]
-    turn = jnp.concatenate([jnp.zeros(2), best.T_map_odom[2:]])
-    mismatch = squared_residuals(turn, jnp.diff(reading.p, axis=0), jnp.diff(q, axis=0))
-    pair = (best.is_inlier[1:] & best.is_inlier[:-1]).astype(mismatch.dtype)
-    mean = jnp.sum(pair * mismatch) / jnp.maximum(jnp.sum(pair), 1.0)
-    return {
-        "tao": best.cost,
-        "tao_geom": best.geom,
-        # A term to look at; it couples neighbours, so it is no part of the joint objective.
-        "tao_vel": config.lambda_velocity * mean / delta_m**2,
-        "tao_sim": best.sim,
-        "tao_rival": reading.rival,
-    }
-
-
 def _spread(tables: MapTables, index: Array, similarity: Array) -> Array:
     """Return the similarity of every map image; NaN where the list lacks it.
 
@@ -223,25 +170,6 @@ def _spread(tables: MapTables, index: Array, similarity: Array) -> Array:
     m = tables.grid.xy.shape[0]
     listed = jnp.where(index >= 0, index, m)
     return jnp.full(m, jnp.nan).at[listed].set(similarity, mode="drop")
-
-
-def _watch(
-    state: StreamState, odometry: Array, answer: _Answer, has_pose: Array, is_full: Array, mask_m
-) -> tuple[Array, Array, Array]:
-    """Follow the last established alignment and notice when fresh evidence contradicts it.
-
-    Returns:
-        Dead-reckoned or newly established pose, whether one was ever established, whether the
-        robot is lost: moved without odometry noticing, and no branch established since.
-    """
-    predicted = compose(state.pose, odometry)
-    is_established = has_pose & is_full & (answer.share >= ESTABLISHED_SHARE)
-    gap = answer.pose[:2] - predicted[:2]
-    is_far = jnp.hypot(gap[0], gap[1]) > mask_m
-    is_noticed = state.was_established & has_pose & answer.is_fresh & is_far
-    is_lost = ~is_established & (state.is_lost | is_noticed)
-    pose = jnp.where(is_established, answer.pose, predicted)
-    return pose, state.was_established | is_established, is_lost
 
 
 @eqx.filter_jit
@@ -295,16 +223,20 @@ def step(
         "tao_rank_vel": cheapest.vel,
         "tao_rank_sim": cheapest.sim,
     }
-    if state.joint is None:
-        joint = None
+    if state.memory is None:
+        memory = None
         terms = {name.replace("_rank", ""): value for name, value in rank_terms.items()}
-        terms["tao_rival"] = terms["tao"]
-        answer = _rank_answer(best, is_filled, index[rank])
+        terms |= {name: terms["tao"] for name in ("tao_window", "tao_rival")}
+        terms["recursive"] = signals.top1(similarity)
+        answer = rank_answer(best, is_filled, index[rank])
     else:
         row = _spread(tables, index, similarity)
-        joint, reading = joint_step(config, tables, state.joint, odometry, index, row)
-        terms = _joint_terms(config, params.delta_m, tables, reading)
-        answer = _joint_answer(tables, reading)
+        scaled = rescale(tables.scale, row)
+        joint, reading = joint_step(config, tables, state.memory.joint, odometry, index, scaled)
+        belief, elsewhere = recursive_step(tables, state.memory.recursive, odometry, scaled)
+        memory = Memory(joint, belief)
+        terms = joint_terms(config, params.delta_m, tables, reading) | {"recursive": elsewhere}
+        answer = joint_answer(tables, reading)
     values = {
         "top1": signals.top1(similarity),
         **windowed,
@@ -328,11 +260,9 @@ def step(
 
     is_warm = n_seen >= FRESH_FRAMES
     has_pose = has_candidates & is_warm
-    pose, was_established, is_lost = _watch(
-        state, odometry, answer, has_pose, is_filled[0], params.mask_m
-    )
+    established = watch(state.established, odometry, answer, has_pose, is_filled[0], params.mask_m)
     status = jnp.select(
-        [~is_warm, ~has_candidates, answer.is_degenerate, is_lost],
+        [~is_warm, ~has_candidates, answer.is_degenerate, established.is_lost],
         [WARMING_UP, NO_CANDIDATES, DEGENERATE, LOST],
         OK,
     )
@@ -351,10 +281,8 @@ def step(
         is_filled=is_filled,
         top1=history,
         n_seen=n_seen,
-        pose=pose,
-        was_established=was_established,
-        is_lost=is_lost,
-        joint=joint,
+        established=established,
+        memory=memory,
     )
     return state, record
 

@@ -1,0 +1,1 @@
+"""Benchmarks that a reader can repeat: `python -m benchmarks VERB`."""

@@ -1,0 +1,37 @@
+"""The command line of the benchmarks; imports happen inside the verbs, so that help is fast."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+"""Where real recordings lie when `--data` does not say: beside the checkout."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    quality = verbs.add_parser("quality", help="leaderboard of map-out detection, losses included")
+    quality.add_argument("--quick", action="store_true", help="fewer seeds, slow systems left out")
+    quality.add_argument("--out", type=Path, help="folder to make (default runs/quality/TIME)")
+    quality.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
+    quality.add_argument("--only", default="", help="only data sets whose name contains this")
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    args = _parser().parse_args(arguments)
+    from benchmarks import quality
+
+    out = args.out or Path("runs") / "quality" / time.strftime("%Y%m%d-%H%M%S")
+    if out.exists() and any(out.iterdir()):
+        print(f"{out} is not empty: choose another --out", file=sys.stderr)
+        return 3
+    quality.run(out, args.data, quick=args.quick, only=args.only)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,244 @@
+"""Who competes: our signals, every rival on the same frames, two oracles that know the truth."""
+
+import time
+from collections.abc import Callable, Collection
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.sets import DataSet
+from taojax.audit import calibration, labels, sequential
+from taojax.baselines.filters import topological, virtual_place
+from taojax.baselines.frames import Frames
+from taojax.baselines.mht import mht
+from taojax.baselines.particles import ParticleParams, particles
+from taojax.baselines.sequence import seqslam, sue
+from taojax.baselines.topometric import TopometricParams, topometric
+from taojax.baselines.trajectory_prior import trajectory_prior
+from taojax.config import Config, StreamConfig
+from taojax.runtime.maps import MapTables, map_tables
+from taojax.runtime.scale import LEAST_RANGE
+from taojax.runtime.score import replay_log
+from taojax.runtime.stream import Frame, StreamRecord
+
+OURS = ("tao", "tao_short", "recursive", "tao_rank")
+"""Columns of our stream that compete; one that the stream lacks is left out."""
+
+FUSED = "probability_map_out"
+
+GATES = ("top1", "top1_w5", "top1_w10", "top1_w20", "margin", "entropy", "velocity", "sue")
+"""Columns that judge the frontend's answer and have no place of their own."""
+
+SYSTEMS: dict[str, Callable[[Frames], NamedTuple]] = {
+    "topometric": topometric,
+    "topometric, both directions": lambda f: topometric(f, TopometricParams(both_directions=True)),
+    "topological": topological,
+    "virtual place": virtual_place,
+    "particles": particles,
+    "particles, injection": lambda f: particles(f, ParticleParams(injection=True)),
+    "mht": mht,
+    "seqslam": seqslam,
+    "sue, authors' constant": sue,
+    "trajectory prior": trajectory_prior,
+}
+"""Rivals that are systems of their own, with published defaults."""
+
+UNCOMPILED = ("particles", "particles, injection", "mht", "sue, authors' constant")
+"""NumPy: the first run is as fast as the second."""
+
+SLOW = ("trajectory prior",)
+"""Left out of a quick run."""
+
+FITTED = (FUSED, "sticky similarity", "sequential test")
+"""Learn from the calibration half, so that only their test half counts."""
+
+ORACLES = ("oracle alignment", "oracle levels")
+
+N_BINS = 20
+"""Of the similarity histogram that the oracle of levels knows."""
+
+
+class Entry(NamedTuple):
+    """What one entrant says of every frame of a set."""
+
+    name: str
+    kind: str
+    """ours, rival or oracle."""
+
+    signal: np.ndarray
+    """(T,) larger = more likely off the map, probabilities as log odds; NaN where nothing could be
+    fitted."""
+
+    place_m: np.ndarray | None = None
+    """(T, 2) believed position [m], NaN without one."""
+
+    us_per_frame: float = float("nan")
+
+
+class Field(NamedTuple):
+    """The labels of a set: what the judge knows."""
+
+    label: np.ndarray
+    share: float
+    gap: int
+
+    def split(self, signals: dict[str, np.ndarray]) -> labels.Splits:
+        """Cut signals into calibration and test."""
+        return labels.split_frames(
+            signals, self.label, calibration_share=self.share, gap_frames=self.gap
+        )
+
+
+def field_of(data: DataSet, config: Config) -> Field:
+    """Label the frames of a set and fix its split."""
+    nearest = labels.nearest_map_distance(data.truth_m, data.map_poses[:, :2])
+    label = labels.label_frames(nearest, data.r_in_m, data.r_out_m)
+    return Field(label, config.audit.calibration_share, config.stream.window)
+
+
+def log_odds(probability: np.ndarray) -> np.ndarray:
+    """Return log odds: mean and deviation of a probability mean little, and ranks stay."""
+    inside = np.clip(probability, 1e-15, 1.0 - 1e-15)
+    return np.log(inside) - np.log1p(-inside)
+
+
+def _timed(function: Callable[[], object], n_frames: int) -> float:
+    start = time.perf_counter()
+    function()
+    return (time.perf_counter() - start) / n_frames * 1e6
+
+
+def stream(data: DataSet, config: StreamConfig) -> tuple[StreamRecord, MapTables, float]:
+    """Replay a set; returns the records, the tables and us/frame without compilation."""
+    tables = map_tables(data.map_poses, config, data.map_descriptors)
+    frames = Frame(*(jnp.asarray(a) for a in (data.odometry, data.index, data.similarity)))
+    whole = Config(stream=config)
+    records = replay_log(whole, tables, frames)
+    some = jax.tree.map(lambda leaf: leaf[:256], frames)
+    return records, tables, _timed(lambda: replay_log(whole, tables, some), len(some.odometry))
+
+
+def rivals(data: DataSet, wanted: Callable[[str], bool]) -> list[Entry]:
+    """Run the systems on the same frames as ours."""
+    frames = Frames(
+        data.map_poses, data.odometry.astype(float), data.rows, data.index, data.similarity
+    )
+    found = []
+    for name, system in SYSTEMS.items():
+        if not wanted(name):
+            continue
+        tracks = []
+        us = _timed(lambda run=system, to=tracks: to.append(run(frames)), len(data.odometry))
+        if name not in UNCOMPILED:
+            us = _timed(lambda run=system: run(frames), len(data.odometry))
+        track = tracks[0]
+        place = np.where(track.map_index[:, None] >= 0, track.pose[:, :2].astype(float), np.nan)
+        found.append(Entry(name, "rival", track.signal.astype(float), place, us))
+    return found
+
+
+def similarity_filters(top1: np.ndarray, field: Field, place: np.ndarray) -> list[Entry]:
+    """Fit the sticky filter and the sequential test of the top-1 signal on the calibration half."""
+    known = field.split({"top1": top1}).calibration
+    chosen = known.is_in | known.is_out
+    slope, bias = sequential.fit_log_likelihood_ratio(
+        known.signals["top1"][chosen], known.is_out[chosen]
+    )
+    ratio = slope * top1 + bias
+    us = _timed(lambda: sequential.sticky_filter(ratio), len(top1))
+    sticky = log_odds(sequential.sticky_filter(ratio))
+    found = [Entry("sticky similarity", "rival", sticky, place, us)]
+    us = _timed(lambda: sequential.sequential_test(ratio), len(top1))
+    test = sequential.sequential_test(ratio).signal
+    return [*found, Entry("sequential test", "rival", test, place, us)]
+
+
+def oracle_alignment(data: DataSet, config: StreamConfig, tables: MapTables) -> np.ndarray:
+    """Return the joint cost at the true alignment, whatever its branches found.
+
+    In every frame of the window the best anchor about the true place is taken: truncated Huber
+    cost of its distance plus 1 - similarity on the fixed scale, under the joint window's weights.
+    """
+    n_map = len(data.map_poses)
+    low, high = np.asarray(tables.scale, float)
+    scaled = np.clip((data.similarity - low) / max(high - low, LEAST_RANGE), 0.0, 1.0)
+    rows = np.zeros((len(data.index), n_map + 1))
+    # Number -1, no candidate, is the spare column; anchors that no list names count as background.
+    np.put_along_axis(rows, np.where(data.index >= 0, data.index, n_map), scaled, axis=1)
+    delta = float(config.delta_spacings) * float(tables.spacing_m)
+    gap = data.seen_m[:, None] - data.map_poses[None, :, :2]
+    r = np.hypot(gap[..., 0], gap[..., 1]) / delta
+    residual = np.where(r <= 1.0, 0.5 * r**2, r - 0.5)
+    cost = np.minimum(1.0, (residual + 1.0 - rows[:, :n_map]).min(axis=1))
+    weight = np.exp(-np.arange(config.joint_window) / float(config.memory_frames))
+    n = len(cost)
+    return np.convolve(cost, weight)[:n] / np.convolve(np.ones(n), weight)[:n]
+
+
+def oracle_levels(top1: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Return the log odds of a sticky filter that knows both classes' similarity histograms."""
+    known = label != "grey"
+    edges = np.quantile(top1[known], np.linspace(0.0, 1.0, N_BINS + 1)[1:-1])
+    place = np.searchsorted(edges, top1)
+
+    def log_share(chosen: np.ndarray) -> np.ndarray:
+        count = np.bincount(place[chosen], minlength=N_BINS) + 0.5
+        return np.log(count / count.sum())
+
+    ratio = log_share(label == "map_out") - log_share(label == "in_map")
+    return log_odds(sequential.sticky_filter(ratio[place]))
+
+
+def _ours(data: DataSet, field: Field, run: tuple[StreamRecord, MapTables, float]) -> list[Entry]:
+    """Read our columns and fit the fused probability on the calibration half."""
+    records, _, us = run
+    columns = {name: np.asarray(values, float) for name, values in records.signals.items()}
+    place = np.where(records.has_pose[:, None], records.pose[:, :2].astype(float), np.nan)
+    found = [
+        Entry(name, "ours", columns[name], None if name == "tao_rank" else place, us)
+        for name in OURS
+        if name in columns
+    ]
+    model = calibration.fit(field.split(columns).calibration)
+    probability = calibration.predict(model, columns)
+    more = _timed(lambda: calibration.predict(model, columns), len(data.odometry))
+    return [*found, Entry(FUSED, "ours", log_odds(probability), place, us + more)]
+
+
+def compete(
+    data: DataSet, config: Config, *, quick: bool = False, names: Collection[str] | None = None
+) -> tuple[Field, list[Entry]]:
+    """Let everybody judge the same frames.
+
+    Args:
+        data: the set.
+        config: ours; rivals keep their published defaults.
+        quick: leave out the slow systems.
+        names: only these entrants; all when omitted.
+
+    Returns:
+        The labels, and one entry per entrant: ours, rivals, oracles.
+    """
+
+    def wanted(name: str) -> bool:
+        return not (quick and name in SLOW) if names is None else name in names
+
+    field = field_of(data, config)
+    run = stream(data, config.stream)
+    top1 = np.asarray(run[0].signals["top1"], float)
+    top = data.index[:, 0]
+    answer = np.where(top[:, None] >= 0, data.map_poses[np.maximum(top, 0), :2], np.nan)
+    gates = [
+        Entry(name, "rival", np.asarray(run[0].signals[name], float), answer) for name in GATES
+    ]
+    entries = [
+        *_ours(data, field, run),
+        *gates,
+        *similarity_filters(top1, field, answer),
+        *rivals(data, wanted),
+        Entry(ORACLES[0], "oracle", oracle_alignment(data, config.stream, run[1])),
+        Entry(ORACLES[1], "oracle", oracle_levels(top1, field.label)),
+    ]
+    return field, [entry for entry in entries if wanted(entry.name)]

@@ -1,0 +1,97 @@
+"""The frozen numbers of a calibrated detector: fitted by the judge, carried to run time in a file.
+
+A linear model of the log odds of being off the map, over sealed signals. Each frame is judged from
+its own row; memory is in the signals.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from taojax.errors import InputError
+from taojax.specs import column_names, read_text
+
+LARGEST_LOG_ODDS = 30.0
+"""Keeps probabilities inside (0, 1) in float64."""
+
+
+class Detector(NamedTuple):
+    """Everything that `probability` needs."""
+
+    columns: tuple[str, ...]
+    """Signals it reads."""
+
+    mean: Float[np.ndarray, " f"]
+    scale: Float[np.ndarray, " f"]
+    weight: Float[np.ndarray, " f"]
+    """Log odds per standardised signal."""
+
+    bias: float
+    threshold: float
+    """Frames with a probability above it are rejected; NaN = nothing can be decided."""
+
+    note: str
+    """How it was fitted, in words."""
+
+
+def log_odds_terms(
+    detector: Detector, signals: Mapping[str, np.ndarray]
+) -> Float[np.ndarray, "t f"]:
+    """Return what each signal adds to the log odds of each frame."""
+    table = np.stack([np.asarray(signals[name], float) for name in detector.columns], axis=1)
+    return (table - detector.mean[None]) / detector.scale[None] * detector.weight[None]
+
+
+def probability(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
+    """Return the probability of being off the map, frame by frame; no frame sees another.
+
+    Args:
+        detector: fitted numbers.
+        signals: column -> (t,).
+    """
+    # Summed by hand: a matrix product may round differently for other numbers of frames.
+    log_odds = np.sum(log_odds_terms(detector, signals), axis=1) + detector.bias
+    return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
+
+
+def to_toml(detector: Detector) -> str:
+    """Return the text of a calibration file."""
+    lines = [
+        "# Written by `taojax evaluate`; read by `taojax score --calibration FILE`.",
+        "columns = [" + ", ".join(f'"{name}"' for name in detector.columns) + "]",
+    ]
+    for name in ("mean", "scale", "weight"):
+        values = ", ".join(repr(float(value)) for value in getattr(detector, name))
+        lines.append(f"{name} = [{values}]")
+    lines += [f"bias = {float(detector.bias)!r}", f"threshold = {float(detector.threshold)!r}"]
+    note = detector.note.replace("\\", "/").replace('"', "'")
+    return "\n".join([*lines, f'note = "{note}"']) + "\n"
+
+
+def from_toml(path: Path) -> Detector:
+    """Read a calibration file.
+
+    Raises:
+        InputError: unreadable, or its numbers do not fit together.
+    """
+    fix = "use the calibration.toml of a run made by `taojax audit`"
+    try:
+        tree = tomllib.loads(read_text(path))
+        columns = tuple(tree["columns"])
+        vectors = [np.array(tree[name], float) for name in ("mean", "scale", "weight")]
+        bias, threshold = float(tree["bias"]), float(tree["threshold"])
+        note = str(tree["note"])
+    except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: is not a calibration file ({error}); {fix}") from error
+    unknown = sorted(set(columns) - set(column_names("signals")))
+    if unknown:
+        raise InputError(f"{path}: unknown signal {unknown[0]!r}; {fix}")
+    numbers = np.concatenate([*(vector.ravel() for vector in vectors), [bias]])
+    fits = all(vector.shape == (len(columns),) for vector in vectors)
+    if not fits or not np.isfinite(numbers).all() or not (vectors[1] > 0).all():
+        raise InputError(f"{path}: mean, scale and weight do not fit the columns; {fix}")
+    return Detector(columns, vectors[0], vectors[1], vectors[2], bias, threshold, note)

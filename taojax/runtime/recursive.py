@@ -1,0 +1,102 @@
+"""A recursive filter on the map's own graph: evidence that persists, beside windows that forget.
+
+Hidden states are every anchor in both travel directions and one state off the map. The robot moves
+by odometry, positions spread over neighbouring anchors, a little mass always leaks off the map, and
+an answer multiplies each anchor's mass by exp(EVIDENCE s), where s is its similarity on the fixed
+scale; off the map nothing is expected. No number here is fitted.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from taojax.core.association import look_up
+from taojax.core.se2 import rotate
+from taojax.runtime.maps import MapTables
+
+EVIDENCE = 8.0
+"""Log likelihood ratio of a strong match against background."""
+
+LEAK = 0.02
+"""Probability per frame of leaving the map."""
+
+STAY_OFF = 0.9
+"""Probability per frame of staying off the map."""
+
+START_OFF = 0.3
+"""Probability of starting off the map."""
+
+LOCAL_SPACINGS = 6.0
+"""Mass within so many map spacings of the likeliest anchor counts as one place."""
+
+REACH_SPACINGS = 2.0
+"""A predicted position farther than this from every anchor has left the map."""
+
+
+class RecursiveState(eqx.Module):
+    """The belief; sums to one together with `off`."""
+
+    mass: Float[Array, "2 m"]
+    """Anchors, facing as the map does and the other way."""
+
+    off: Float[Array, ""]
+
+
+def init_recursive(n_anchors: int) -> RecursiveState:
+    """Return the belief before the first frame: anywhere."""
+    # Explicit types: a weakly typed start would compile the second step again.
+    mass = jnp.full((2, n_anchors), (1.0 - START_OFF) / (2 * n_anchors), jnp.float32)
+    return RecursiveState(mass, jnp.full((), START_OFF, jnp.float32))
+
+
+def recursive_step(
+    tables: MapTables,
+    state: RecursiveState,
+    odometry: Float[Array, "3"],
+    scaled: Float[Array, " m"],
+) -> tuple[RecursiveState, Float[Array, ""]]:
+    """Advance the belief by one frame.
+
+    Args:
+        tables: the map.
+        state: the belief.
+        odometry: motion into this frame, finite.
+        scaled: `(m,)` similarity of every anchor on the fixed scale.
+
+    Returns:
+        The belief, and the probability of not being where the belief is strongest.
+    """
+    grid, spacing_m = tables.grid, tables.spacing_m
+    m = grid.xy.shape[0]
+    driven = jnp.hypot(odometry[0], odometry[1])
+    # Half a spacing of doubt once the robot has moved half a spacing, and 15 % of the distance.
+    doubt = 0.5 * spacing_m * jnp.minimum(1.0, driven / (0.5 * spacing_m))
+    variance = doubt**2 + (0.1 * spacing_m) ** 2 + (0.15 * driven) ** 2
+    kernel = jnp.exp(-0.5 * grid.neighbour_m2 / variance)
+    kernel = kernel / jnp.sum(kernel, axis=1, keepdims=True)
+    spread = jnp.sum(kernel[None] * state.mass[:, grid.neighbour], axis=-1)
+
+    facing = grid.theta[None] + jnp.array([[0.0], [jnp.pi]]) - odometry[2]
+    step = jnp.broadcast_to(odometry[:2], (2, m, 2))
+    before = (grid.xy[None] - rotate(facing, step)).reshape(2 * m, 2)
+    source = look_up(grid, before)
+    known = jnp.maximum(source, 0)
+    gap = jnp.sum((grid.xy[known] - before) ** 2, axis=1)
+    is_linked = ((source >= 0) & (gap < (REACH_SPACINGS * spacing_m) ** 2)).reshape(2, m)
+    known = known.reshape(2, m)
+    # A loop driven the other way later has anchors that face against their neighbours.
+    is_same = jnp.cos(grid.theta[known] - (grid.theta[None] - odometry[2])) >= 0
+    direction = jnp.array([[0], [1]])
+    arriving = spread[jnp.where(is_same, direction, 1 - direction), known]
+    arriving = jnp.where(is_linked, (1.0 - LEAK) * arriving, 0.0)
+    gone = jnp.maximum(1.0 - state.off - jnp.sum(arriving), 0.0)
+    off = STAY_OFF * state.off + gone
+    mass = arriving + (1.0 - STAY_OFF) * state.off / (2 * m)
+
+    mass = mass * jnp.exp(EVIDENCE * scaled)[None]
+    total = jnp.sum(mass) + off
+    mass, off = mass / total, off / total
+    anywhere = jnp.sum(mass, axis=0)
+    away = grid.xy - grid.xy[jnp.argmax(anywhere)][None]
+    is_local = jnp.sum(away**2, axis=1) < (LOCAL_SPACINGS * spacing_m) ** 2
+    return RecursiveState(mass, off), 1.0 - jnp.sum(jnp.where(is_local, anywhere, 0.0))
