@@ -44,9 +44,13 @@ class Answer(NamedTuple):
     """The newest frames are all inliers."""
 
     is_degenerate: Bool[Array, ""]
+    is_known: Bool[Array, ""]
+    """There is a hypothesis at all."""
 
 
-def rank_answer(best: BranchCost, is_filled: Array, map_index: Array) -> Answer:
+def rank_answer(
+    best: BranchCost, is_filled: Array, map_index: Array, has_candidates: Array
+) -> Answer:
     """Return the answer of the best rank branch."""
     n_filled = jnp.sum(is_filled.astype(best.geom.dtype))
     return Answer(
@@ -55,6 +59,7 @@ def rank_answer(best: BranchCost, is_filled: Array, map_index: Array) -> Answer:
         share=jnp.sum(best.is_inlier.astype(best.geom.dtype)) / n_filled,
         is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
         is_degenerate=best.is_degenerate,
+        is_known=has_candidates,
     )
 
 
@@ -70,6 +75,8 @@ def joint_answer(tables: MapTables, reading: JointReading) -> Answer:
         is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
         # The heading prior determines the angle; without any inlier the seed itself is the pose.
         is_degenerate=jnp.zeros((), bool),
+        # The carried branch bridges a frame without candidates.
+        is_known=reading.is_known,
     )
 
 

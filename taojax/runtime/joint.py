@@ -49,6 +49,9 @@ class JointReading(eqx.Module):
     rival: Float[Array, ""]
     """Cost of the cheapest branch somewhere else."""
 
+    is_known: Bool[Array, ""]
+    """Some frame so far had a candidate; without one the best branch is a guess."""
+
     is_filled: Bool[Array, " n"]
     """In time order."""
 
@@ -145,6 +148,7 @@ def joint_step(
         best,
         (best.anchor[order], best.frame_cost[order], best.is_inlier[order]),
     )
+    has_carried = state.has_carried | jnp.any(is_seed)
     state = JointState(
         p=p,
         rows=rows,
@@ -152,6 +156,6 @@ def joint_step(
         is_filled=is_filled,
         slot=jnp.mod(slot + 1, n),
         carried=best.T_map_odom,
-        has_carried=state.has_carried | jnp.any(is_seed),
+        has_carried=has_carried,
     )
-    return state, JointReading(in_time, rival, is_filled[order], p[order, :2])
+    return state, JointReading(in_time, rival, has_carried, is_filled[order], p[order, :2])

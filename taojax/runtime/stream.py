@@ -228,7 +228,7 @@ def step(
         terms = {name.replace("_rank", ""): value for name, value in rank_terms.items()}
         terms |= {name: terms["tao"] for name in ("tao_window", "tao_rival")}
         terms["recursive"] = signals.top1(similarity)
-        answer = rank_answer(best, is_filled, index[rank])
+        answer = rank_answer(best, is_filled, index[rank], has_candidates)
     else:
         row = _spread(tables, index, similarity)
         scaled = rescale(tables.scale, row)
@@ -259,7 +259,7 @@ def step(
     }
 
     is_warm = n_seen >= FRESH_FRAMES
-    has_pose = has_candidates & is_warm
+    has_pose = answer.is_known & is_warm
     established = watch(state.established, odometry, answer, has_pose, is_filled[0], params.mask_m)
     status = jnp.select(
         [~is_warm, ~has_candidates, answer.is_degenerate, established.is_lost],
