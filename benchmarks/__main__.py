@@ -17,19 +17,28 @@ def _parser() -> argparse.ArgumentParser:
     quality.add_argument("--out", type=Path, help="folder to make (default runs/quality/TIME)")
     quality.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     quality.add_argument("--only", default="", help="only data sets whose name contains this")
+    ablation = verbs.add_parser("ablation", help="what each ingredient is worth")
+    ablation.add_argument("--out", type=Path, help="folder to make (default runs/ablation/TIME)")
+    ablation.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
+    ablation.add_argument("--only", default="", help="only data sets whose name contains this")
     return parser
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     args = _parser().parse_args(arguments)
-    from benchmarks import quality
-
-    out = args.out or Path("runs") / "quality" / time.strftime("%Y%m%d-%H%M%S")
+    out = args.out or Path("runs") / args.verb / time.strftime("%Y%m%d-%H%M%S")
     if out.exists() and any(out.iterdir()):
         print(f"{out} is not empty: choose another --out", file=sys.stderr)
         return 3
-    quality.run(out, args.data, quick=args.quick, only=args.only)
+    if args.verb == "ablation":
+        from benchmarks import ablation
+
+        ablation.run(out, args.data, only=args.only)
+    else:
+        from benchmarks import quality
+
+        quality.run(out, args.data, quick=args.quick, only=args.only)
     return 0
 
 

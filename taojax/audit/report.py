@@ -165,7 +165,7 @@ def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> lis
 def _mapout_columns(key: str) -> tuple[str, ...]:
     measured = (f"top1_{key}", f"paper_top1_{key}", f"velocity_{key}", f"paper_tao_{key}")
     ours = (f"tao_rank_{key}", f"tao_{key}", *(["fused_far"] if key == "far" else []))
-    return ("scenario", "map_out_frames", "paper_map_out_frames", *measured, *ours)
+    return ("scenario", "map_out_frames", *measured, *ours)
 
 
 def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
