@@ -1,7 +1,6 @@
 """A whole data set through the stream into one sealed table, with progress."""
 
 import platform
-import sys
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -156,7 +155,8 @@ def score(
     tables = map_tables(np.stack(xyt, axis=1), config.stream, known)
     frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))
     records = replay_log(config, tables, frames, progress=progress)
-    command = " ".join(["taojax", *sys.argv[1:]])
+    # What repeats this run, seen from its own folder; the words typed may name files long gone.
+    command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records)
     return write_run(
         out,
