@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.entrants import Field, field_of, stream
 from benchmarks.sets import DataSet, recipes
+from taojax import detector
 from taojax.audit import calibration, metrics
 from taojax.config import AuditConfig, Config, StreamConfig
 from taojax.core import association
@@ -75,7 +76,7 @@ def _test_cell(columns: dict[str, np.ndarray], field: Field) -> str:
     splits = field.split(columns)
     model = calibration.fit(splits.calibration)
     known = splits.test.is_in | splits.test.is_out
-    p = calibration.predict(model, splits.test.signals)[known]
+    p = detector.probability(model, splits.test.signals)[known]
     return f"{metrics.auroc(p, splits.test.is_out[known]):.3f}"
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.sets import DataSet
+from taojax import detector
 from taojax.audit import calibration, labels, sequential
 from taojax.baselines.filters import topological, virtual_place
 from taojax.baselines.frames import Frames
@@ -202,8 +203,8 @@ def _ours(data: DataSet, field: Field, run: tuple[StreamRecord, MapTables, float
         if name in columns
     ]
     model = calibration.fit(field.split(columns).calibration)
-    probability = calibration.predict(model, columns)
-    more = _timed(lambda: calibration.predict(model, columns), len(data.odometry))
+    probability = detector.probability(model, columns)
+    more = _timed(lambda: detector.probability(model, columns), len(data.odometry))
     return [*found, Entry(FUSED, "ours", log_odds(probability), place, us + more)]
 
 

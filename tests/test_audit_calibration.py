@@ -46,16 +46,16 @@ def test_there_is_no_threshold_without_an_in_map_frame():
 def test_the_model_ranks_held_out_frames(rng):
     model = calibration.fit(split_of(*frames(rng, 120, 80)))
     signals, label = frames(rng, 100, 100)
-    p = calibration.predict(model, signals)
+    p = probability(model, signals)
     assert ((p > 0) & (p < 1)).all()
     pairs = p[label == "map_out"][:, None] > p[label == "in_map"][None]
     assert pairs.mean() > 0.9
 
 
 def test_the_probability_follows_the_prior_of_the_calibration_split(rng):
-    few = calibration.predict(calibration.fit(split_of(*frames(rng, 190, 10, shift=0.0))),
+    few = probability(calibration.fit(split_of(*frames(rng, 190, 10, shift=0.0))),
                               frames(rng, 50, 0)[0])  # fmt: skip
-    many = calibration.predict(calibration.fit(split_of(*frames(rng, 10, 190, shift=0.0))),
+    many = probability(calibration.fit(split_of(*frames(rng, 10, 190, shift=0.0))),
                                frames(rng, 50, 0)[0])  # fmt: skip
     assert few.mean() < 0.2
     assert many.mean() > 0.8
@@ -64,15 +64,15 @@ def test_the_probability_follows_the_prior_of_the_calibration_split(rng):
 def test_a_probability_depends_on_its_own_frame_alone(rng):
     model = calibration.fit(split_of(*frames(rng, 60, 40)))
     signals, _ = frames(rng, 20, 20)
-    whole = calibration.predict(model, signals)
-    part = calibration.predict(model, {k: v[:13] for k, v in signals.items()})
+    whole = probability(model, signals)
+    part = probability(model, {k: v[:13] for k, v in signals.items()})
     np.testing.assert_array_equal(whole[:13], part)
 
 
 def test_a_constant_feature_leaves_finite_probabilities(rng):
     signals, label = frames(rng, 30, 30)
     signals["tao_rival"] = np.zeros(60)
-    p = calibration.predict(calibration.fit(split_of(signals, label)), signals)
+    p = probability(calibration.fit(split_of(signals, label)), signals)
     assert np.isfinite(p).all()
 
 
@@ -82,7 +82,7 @@ def test_too_few_frames_of_a_class_give_a_fallback_that_says_so(rng, n_out):
     assert "fallback" in model.note
     assert f"30 in-map and {n_out} map-out" in model.note
     signals, label = frames(rng, 40, 40)
-    p = calibration.predict(model, signals)
+    p = probability(model, signals)
     assert ((p > 0) & (p < 1)).all()
     pairs = p[label == "map_out"][:, None] > p[label == "in_map"][None]
     assert pairs.mean() > 0.8

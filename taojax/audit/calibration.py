@@ -1,6 +1,5 @@
 """From signals to thresholds and probabilities; everything is fitted on the calibration split."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -105,11 +104,6 @@ def _accepting(inside: Float[np.ndarray, " n"]) -> float:
     if not inside.size or np.isnan(inside).any():
         return float("nan")
     return float(np.sort(inside)[int(np.ceil(ACCEPTED_SHARE * len(inside))) - 1])
-
-
-def predict(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
-    """Return the probability of being map-out, in (0, 1), frame by frame."""
-    return probability(detector, signals)
 
 
 def sigma_threshold(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from taojax.audit import calibration, labels, metrics, tables
-from taojax.audit.conformal import Promise, conformal_threshold
+from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
 from taojax.audit.verdicts import decide
 from taojax.config import Config
@@ -91,12 +91,11 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     share, gap = audit.calibration_share, config.stream.window
     first = labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
     model = calibration.fit(first.calibration)
-    probability = calibration.predict(model, signals)
+    verdicts = decide(run.signals, first.calibration, model)
     # Cut again with the probability beside the signals: only the splitter makes the two tables.
-    with_fused = signals | {tables.FUSED: probability}
+    with_fused = signals | {tables.FUSED: verdicts["probability_map_out"]}
     splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)
 
-    verdicts = decide(run.signals, splits.calibration, model)
     error = np.hypot(run.signals["x_m"] - truth.xy_m[:, 0], run.signals["y_m"] - truth.xy_m[:, 1])
     inside, test = label == "in_map", splits.name == "test"
     accepted = verdicts["verdict"] == "accept"
@@ -124,13 +123,7 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         recall=tables.recall_table(curves, nearest),
         micro=tables.micro_table(signals, nearest, audit, config.seed),
         conformal=tables.conformal_table(tuple(signals), splits, audit),
-        promise=conformal_threshold(
-            splits.calibration,
-            "tao",
-            alpha=audit.alpha,
-            confidence=audit.confidence,
-            block_frames=audit.block_frames,
-        ),
+        promise=tables.promised(splits.calibration, "tao", audit),
         errors=tables.errors_table(error, groups, 2 * audit.r_in_m),
         detector=model,
         clock_gap_s=float(np.max(np.abs(truth.t_s - run.signals["t_s"]))),

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from taojax.audit import bootstrap, calibration, metrics
-from taojax.audit.conformal import conformal_threshold, realised
+from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.audit.verdicts import plain
 from taojax.config import AuditConfig
@@ -160,6 +160,17 @@ def metrics_table(
     return from_rows("metrics", rows)
 
 
+def promised(split: CalibrationSplit, name: str, config: AuditConfig) -> Promise:
+    """Return what the conformal rule promises for one signal at the configured level."""
+    return conformal_threshold(
+        split,
+        name,
+        alpha=config.alpha,
+        confidence=config.confidence,
+        block_frames=config.block_frames,
+    )
+
+
 def conformal_table(names: Sequence[str], splits: Splits, config: AuditConfig) -> Table:
     """Promise a false acceptance rate for every signal, and say what came of it on the test split.
 
@@ -170,13 +181,7 @@ def conformal_table(names: Sequence[str], splits: Splits, config: AuditConfig) -
     """
     rows = []
     for name in names:
-        promise = conformal_threshold(
-            splits.calibration,
-            name,
-            alpha=config.alpha,
-            confidence=config.confidence,
-            block_frames=config.block_frames,
-        )
+        promise = promised(splits.calibration, name, config)
         is_promised = np.isfinite(promise.threshold)
         rows.append(
             {

@@ -142,7 +142,8 @@ def joint_step(
     is_elsewhere = jnp.sum(gap**2, axis=1) > (DISTINCT_DELTAS * params.delta_m) ** 2
     rival = jnp.minimum(GAMMA, jnp.min(jnp.where(is_elsewhere, cost, GAMMA)))
 
-    order = jnp.argsort(age)[::-1]
+    # The ring read from its oldest slot to its newest.
+    order = jnp.mod(slot + 1 + jnp.arange(n), n)
     in_time = eqx.tree_at(
         lambda b: (b.anchor, b.frame_cost, b.is_inlier),
         best,
