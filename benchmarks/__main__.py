@@ -21,6 +21,12 @@ def _parser() -> argparse.ArgumentParser:
     ablation.add_argument("--out", type=Path, help="folder to make (default runs/ablation/TIME)")
     ablation.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     ablation.add_argument("--only", default="", help="only data sets whose name contains this")
+    refinement = verbs.add_parser("refinement", help="what the true Huber minimum buys and costs")
+    refinement.add_argument("--quick", action="store_true", help="500 windows instead of 10,000")
+    refinement.add_argument(
+        "--out", type=Path, help="folder to make (default runs/refinement/TIME)"
+    )
+    refinement.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     return parser
 
 
@@ -35,6 +41,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import ablation
 
         ablation.run(out, args.data, only=args.only)
+    elif args.verb == "refinement":
+        from benchmarks import refinement
+
+        refinement.run(out, args.data, quick=args.quick)
     else:
         from benchmarks import quality
 

@@ -1,0 +1,189 @@
+r"""The minimum of the true Huber objective of Eq. 1: what the closed form only approximates.
+
+The closed form minimises a quadratic. Re-weighting every frame by min(1, delta / r) gives a
+quadratic that lies above the Huber objective and touches it at the present alignment, so solving
+it in closed form, again and again, can only lower the cost: iteratively re-weighted least squares
+(IRLS). Its fixed points are the stationary points of Eq. 1, and optimistix looks for one.
+
+No line search, no damping, no linear system: under `vmap` on a CPU it was 1.2 times (hopeless
+branches) to 8 times faster than optimistix's BFGS and 25 to 110 times than its Levenberg-Marquardt,
+at the same optimum. Off by default: `python -m benchmarks refinement` shows what it buys and costs.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from taojax.core.cost import MIN_PAIRS, Branch, CostParams, huber, squared_residuals
+from taojax.core.procrustes import angle_evidence, fit_se2, weighted_mean
+from taojax.core.se2 import rotate, wrap
+
+STATUSES = ("converged", "stalled", "degenerate", "not_finite")
+CONVERGED, STALLED, DEGENERATE, NOT_FINITE = range(4)
+
+TOLERANCE = 1e-5
+"""Step at which the iteration stops, in radii of the window. The cost is flat at its minimum:
+its relative error is far smaller. Part of the detector wherever the refined cost is the signal."""
+
+MAX_STEPS = 64
+"""A batch runs as long as its slowest branch; hopeless branches are the slow ones."""
+
+
+class Refinement(eqx.Module):
+    """A branch at the minimum of Eq. 1 nearest to its start."""
+
+    T_map_odom: Float[Array, "*k 3"]
+    """Alignment; a constant to `jax.grad`."""
+
+    cost: Float[Array, "*k"]
+    """Eq. 1 there, all terms, never above `start_cost` [m^2]; infinite if `not_finite`."""
+
+    start_cost: Float[Array, "*k"]
+    """Eq. 1 at the start [m^2]; infinite if `not_finite`."""
+
+    status: Int[Array, "*k"]
+    """Position in `STATUSES`. Stalled: the steps ran out, what was found so far is returned.
+    Degenerate: the pairs do not determine the alignment, the start is returned."""
+
+    n_steps: Int[Array, "*k"]
+    """Closed-form solutions computed."""
+
+
+def _pair_weights(is_on: Bool[Array, " n"], like: Float[Array, "n 2"]) -> Float[Array, " n-1"]:
+    """Share the velocity term among the consecutive pairs of which both frames take part."""
+    pair = (is_on[1:] & is_on[:-1]).astype(like.dtype)
+    return pair / jnp.maximum(jnp.sum(pair), 1.0)
+
+
+def cost_at(
+    params: CostParams,
+    p: Float[Array, "n 2"],
+    branch: Branch,
+    weight: Float[Array, " n"],
+    T_map_odom: Float[Array, "3"],
+) -> Float[Array, ""]:
+    """Evaluate Eq. 1 at any alignment, over all frames, without residual mask [m^2].
+
+    Args:
+        params: weights and length scales.
+        p: `(n, 2)` local trajectory in time order, metres.
+        branch: one anchor per frame.
+        weight: `(n,)` weights of the window frames, summing to one.
+        T_map_odom: the alignment.
+
+    Returns:
+        The number that `branch_cost` reports as `total` at its own alignment.
+    """
+    q = jnp.where(branch.has_anchor[:, None], branch.q, 0.0)
+    rho = huber(squared_residuals(T_map_odom, p, q), params.delta_m)
+    geom = jnp.sum(weight * jnp.where(branch.has_anchor, rho, params.tau_missing))
+    pair = _pair_weights(branch.has_anchor & (weight > 0), p)
+    turn_only = jnp.concatenate([jnp.zeros(2, p.dtype), T_map_odom[2:]])
+    mismatch = squared_residuals(turn_only, p[1:] - p[:-1], q[1:] - q[:-1])
+    similarity = jnp.where(branch.has_anchor, branch.similarity, 0.0)
+    return (
+        geom
+        + params.lambda_velocity * jnp.sum(pair * mismatch)
+        + params.gamma_similarity * jnp.sum(weight * (1.0 - similarity))
+    )
+
+
+def _solve(
+    params: CostParams,
+    p: Float[Array, "n 2"],
+    branch: Branch,
+    weight: Float[Array, " n"],
+    start: Float[Array, "3"],
+) -> tuple[Float[Array, "3"], Int[Array, ""], Int[Array, ""]]:
+    """Iterate to a fixed point; returns alignment, status and number of steps.
+
+    Works on the increment to the start, about the centre of the window, in units of its radius:
+    float32 stays exact far from the origin, one tolerance fits shift and turn, and the angle
+    stays away from the seam at pi.
+    """
+    is_on = branch.has_anchor & (weight > 0)
+    w = jnp.where(is_on, weight, 0.0)
+    centre = weighted_mean(p, w)
+    target = rotate(start[2], centre) + start[:2]
+    radius_m2 = jnp.sum(weighted_mean((p - centre[None, :]) ** 2, w))
+    unit_m = jnp.sqrt(jnp.maximum(radius_m2, params.delta_m**2))
+    x = (p - centre[None, :]) / unit_m
+    gap = jnp.where(is_on[:, None], branch.q - target[None, :], 0.0) / unit_m
+    y = rotate(jnp.broadcast_to(-start[2], is_on.shape), gap)
+    delta = params.delta_m / unit_m
+    pair = 2.0 * params.lambda_velocity * _pair_weights(is_on, p)
+    velocity = angle_evidence(x[1:] - x[:-1], y[1:] - y[:-1], pair)
+
+    def again(pose: Float[Array, "3"], _: None) -> Float[Array, "3"]:
+        r = jnp.sqrt(jnp.maximum(squared_residuals(pose, x, y), delta**2))
+        return fit_se2(x, y, w * delta / r, velocity).T_map_odom
+
+    found = optx.fixed_point(
+        again,
+        optx.FixedPointIteration(TOLERANCE, TOLERANCE),
+        jnp.zeros_like(start),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    theta = start[2] + found.value[2]
+    shift = target + unit_m * rotate(start[2], found.value[:2])
+    pose = jnp.concatenate([shift - rotate(theta, centre), wrap(theta)[None]])
+    is_degenerate = fit_se2(x, y, w, velocity).is_degenerate | (jnp.sum(is_on) < MIN_PAIRS)
+    is_converged = found.result == optx.RESULTS.successful
+    status = jnp.where(is_converged, CONVERGED, STALLED)
+    return pose, jnp.where(is_degenerate, DEGENERATE, status), found.stats["num_steps"]
+
+
+def refine(
+    params: CostParams,
+    p: Float[Array, "n 2"],
+    branch: Branch,
+    weight: Float[Array, " n"],
+    start: Float[Array, "3"],
+) -> Refinement:
+    """Minimise Eq. 1 for one branch from a start, usually `branch_cost(...).T_map_odom`.
+
+    Args:
+        params: weights and length scales; the residual mask is not used.
+        p: `(n, 2)` local trajectory in time order, last pose at the origin, metres.
+        branch: one anchor per frame; `vmap` over branches and starts.
+        weight: `(n,)` weights of the filled window frames, summing to one.
+        start: `(3,)` alignment to start from.
+
+    Returns:
+        The alignment found, or the start where nothing better was found. The cost is
+        differentiable in everything but the start, exactly at a minimum: its gradient is that of
+        Eq. 1 at a fixed alignment (envelope theorem). The alignment has no gradient.
+
+    Raises:
+        Nothing, also under `vmap`: a branch that is not finite costs infinity and leaves the
+        others alone.
+
+    Source:
+        Huber, Robust Statistics, 1981, section 7.8 (modified weights never raise the objective).
+    """
+    is_finite = jnp.isfinite(cost_at(params, p, branch, weight, start))
+    # Harmless numbers in place of bad ones: NaN times zero is NaN, and so is its gradient.
+    p, weight, start = (jnp.where(is_finite, a, 0.0) for a in (p, weight, start))
+    q, similarity = (jnp.where(is_finite, a, 0.0) for a in (branch.q, branch.similarity))
+    branch = Branch(q, similarity, branch.has_anchor)
+    # optimistix keeps its error in JAX's default precision and refuses to iterate in any other.
+    problem = jax.tree.map(
+        lambda a: a.astype(float) if eqx.is_inexact_array(a) else a,
+        jax.lax.stop_gradient((params, p, branch, weight, start)),
+    )
+    pose, status, n_steps = _solve(*problem)
+    start = jax.lax.stop_gradient(start)
+    pose = pose.astype(start.dtype)
+    start_cost = cost_at(params, p, branch, weight, start)
+    cost = cost_at(params, p, branch, weight, pose)
+    is_better = (cost < start_cost) & (status != DEGENERATE)
+    return Refinement(
+        T_map_odom=jnp.where(is_better, pose, start),
+        cost=jnp.where(is_finite, jnp.where(is_better, cost, start_cost), jnp.inf),
+        start_cost=jnp.where(is_finite, start_cost, jnp.inf),
+        status=jnp.where(is_finite, status, NOT_FINITE).astype(jnp.int32),
+        n_steps=n_steps.astype(jnp.int32),
+    )
