@@ -38,6 +38,9 @@ class AnchorGrid(eqx.Module):
     theta: Float[Array, " m"]
     """Anchor headings [rad]."""
 
+    facing: Float[Array, "m 2"]
+    """The same as unit vectors."""
+
     nearest: Int[Array, " cells"]
     """Row-major grid: the anchor nearest to a cell's centre, -1 where none is in reach."""
 
@@ -133,13 +136,16 @@ def pool(
     return jnp.take_along_axis(grid.neighbour, best[:, None], axis=1)[:, 0]
 
 
-def look_up(grid: AnchorGrid, xy: Float[Array, "n 2"]) -> Int[Array, " n"]:
+def look_up(grid: AnchorGrid, xy: Float[Array, "*n 2"]) -> Int[Array, "*n"]:
     """Return the anchor nearest to each position, -1 where none is in reach."""
-    cell = jnp.floor((xy - grid.corner[None, :]) / grid.cell_m)
-    is_on = jnp.all((cell >= 0) & (cell < grid.shape[None, :].astype(xy.dtype)), axis=-1)
+    x = jnp.floor((xy[..., 0] - grid.corner[0]) / grid.cell_m)
+    y = jnp.floor((xy[..., 1] - grid.corner[1]) / grid.cell_m)
+    width, height = grid.shape[0].astype(xy.dtype), grid.shape[1].astype(xy.dtype)
+    is_on = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     # Clip before the cast: a float beyond int32 has no defined integer.
-    inside = jnp.where(is_on[:, None], cell, 0.0).astype(jnp.int32)
-    return jnp.where(is_on, grid.nearest[inside[:, 0] * grid.shape[1] + inside[:, 1]], -1)
+    column = jnp.where(is_on, x, 0.0).astype(jnp.int32)
+    row = jnp.where(is_on, y, 0.0).astype(jnp.int32)
+    return jnp.where(is_on, grid.nearest[column * grid.shape[1] + row], -1)
 
 
 def _frame_costs(
