@@ -8,7 +8,7 @@ scale; off the map nothing is expected. No number here is fitted.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from taojax.core.association import AnchorGrid, look_up
 from taojax.core.se2 import rotate
@@ -68,7 +68,8 @@ def recursive_step(
     tables: MapTables,
     state: RecursiveState,
     odometry: Float[Array, "3"],
-    scaled: Float[Array, " m"],
+    index: Int[Array, " c"],
+    scaled: Float[Array, " c"],
 ) -> tuple[RecursiveState, Float[Array, ""]]:
     """Advance the belief by one frame.
 
@@ -76,7 +77,8 @@ def recursive_step(
         tables: the map.
         state: the belief.
         odometry: motion into this frame, finite.
-        scaled: `(m,)` similarity of every anchor on the fixed scale.
+        index: `(c,)` candidates, -1 = none.
+        scaled: `(c,)` their similarities on the fixed scale.
 
     Returns:
         The belief, and the probability of not being where the belief is strongest.
@@ -107,7 +109,10 @@ def recursive_step(
     off = STAY_OFF * state.off + gone
     mass = arriving + (1.0 - STAY_OFF) * state.off / (2 * m)
 
-    mass = mass * jnp.exp(EVIDENCE * scaled)[None]
+    # An anchor that the list lacks looks like background, whose evidence is 1.
+    listed = jnp.where(index >= 0, index, m)
+    evidence = jnp.ones(m).at[listed].set(jnp.exp(EVIDENCE * scaled), mode="drop")
+    mass = mass * evidence[None]
     total = jnp.sum(mass) + off
     mass, off = mass / total, off / total
     anywhere = jnp.sum(mass, axis=0)
