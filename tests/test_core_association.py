@@ -14,12 +14,12 @@ from taojax.core.association import (
     JointWindow,
     associate,
     evaluate,
+    find,
     joint_branch,
     look_up,
     objective,
     pool,
     refit,
-    unpaired,
 )
 from taojax.core.se2 import inverse, transform
 from taojax.runtime.maps import map_tables
@@ -29,7 +29,7 @@ M, N = 50, 10
 PLACES = loop(M)
 GRID = map_tables(PLACES).grid
 SPACING_M = float(map_tables(PLACES).spacing_m)
-half_a, half_b = (eqx.filter_jit(f) for f in (associate, refit))
+start, half_a, half_b = (eqx.filter_jit(f) for f in (find, associate, refit))
 follow = eqx.filter_jit(jax.vmap(joint_branch, in_axes=(None, None, None, 0)))
 pools = eqx.filter_jit(jax.vmap(pool, in_axes=(None, None, None, 0)))
 
@@ -68,7 +68,7 @@ def scene(seed, noise=0.3):
 @given(st.integers(0, 10**6), st.floats(0, 0.75, allow_subnormal=False))
 def test_no_half_step_raises_the_truncated_objective(seed, noise):
     params, grid, window, _, pose = scene(seed, noise)
-    theta0, pairing = pose[2], unpaired(window)
+    theta0, pairing = pose[2], start(params, grid, window, pose)
     before = float(value(params, window, pairing, pose, theta0))
     for _ in range(4):
         pairing = half_a(params, grid, window, pairing, pose)

@@ -114,7 +114,7 @@ class Pairing(eqx.Module):
     """Its residual cost rho_delta / delta^2, infinite without an anchor."""
 
     r: Float[Array, " n"]
-    """Its residual, at least delta [m]."""
+    """Its residual [m]."""
 
 
 class JointBranch(eqx.Module):
@@ -187,35 +187,20 @@ def look_up(grid: AnchorGrid, xy: Float[Array, "*n 2"]) -> Int[Array, "*n"]:
     return jnp.where(is_on, grid.nearest[column * grid.shape[1] + row], -1)
 
 
-def unpaired(window: JointWindow) -> Pairing:
-    """Return the pairing before the first look-up."""
-    n = window.weight.shape[0]
-    nothing = jnp.zeros(n)
-    return Pairing(jnp.full(n, -1), jnp.zeros((n, 2)), nothing, jnp.full(n, jnp.inf), nothing)
-
-
 def evaluate(
     params: JointParams, window: JointWindow, pairing: Pairing, pose: Float[Array, "3"]
 ) -> Pairing:
     """Return the same pairs with their residuals at another alignment."""
-    squared = squared_residuals(pose, window.p, pairing.q)
+    r = jnp.sqrt(squared_residuals(pose, window.p, pairing.q))
     # Without an anchor a frame must be truncated whatever its residual.
-    geom = jnp.where(pairing.anchor >= 0, huber(squared, params.delta_m), jnp.inf)
-    r = jnp.sqrt(jnp.maximum(squared, params.delta_m**2))
+    geom = jnp.where(pairing.anchor >= 0, huber(r**2, params.delta_m), jnp.inf)
     return Pairing(pairing.anchor, pairing.q, pairing.sim, geom / params.delta_m**2, r)
 
 
-def associate(
-    params: JointParams,
-    grid: AnchorGrid,
-    window: JointWindow,
-    old: Pairing,
-    pose: Float[Array, "3"],
+def find(
+    params: JointParams, grid: AnchorGrid, window: JointWindow, pose: Float[Array, "3"]
 ) -> Pairing:
-    """Half step (a): give each frame the best anchor near its predicted position.
-
-    The look-up is approximate, so the old anchor stays where it is cheaper.
-    """
+    """Return the best anchor near each frame's predicted position."""
     near = look_up(grid, transform(pose[None], window.p))
     row = jnp.maximum(near, 0)
     frames, c = jnp.arange(near.shape[0]), window.listed.shape[1]
@@ -230,7 +215,21 @@ def associate(
         geom=jnp.zeros_like(similarity),
         r=jnp.zeros_like(similarity),
     )
-    new, old = (evaluate(params, window, pairing, pose) for pairing in (found, old))
+    return evaluate(params, window, found, pose)
+
+
+def associate(
+    params: JointParams,
+    grid: AnchorGrid,
+    window: JointWindow,
+    old: Pairing,
+    pose: Float[Array, "3"],
+) -> Pairing:
+    """Half step (a): give each frame the best anchor near its predicted position.
+
+    The look-up is approximate, so the old anchor stays where it is cheaper.
+    """
+    new, old = find(params, grid, window, pose), evaluate(params, window, old, pose)
     keeps = old.geom + old.sim <= new.geom + new.sim
     return jax.tree.map(
         lambda a, b: jnp.where(keeps if a.ndim == 1 else keeps[:, None], a, b), old, new
@@ -258,7 +257,8 @@ def refit(
         the old pose where no frame has support.
     """
     is_inlier = pairing.geom + pairing.sim < params.gamma
-    weight = jnp.where(is_inlier, window.weight / (pairing.r * params.delta_m), 0.0)
+    r = jnp.maximum(pairing.r, params.delta_m)
+    weight = jnp.where(is_inlier, window.weight / (r * params.delta_m), 0.0)
     prior = AngleEvidence(
         params.kappa * jnp.cos(theta0), params.kappa * jnp.sin(theta0), jnp.asarray(params.kappa)
     )
@@ -292,7 +292,7 @@ def joint_branch(
     Returns:
         The branch after a fixed number of alternations; finite for every finite input.
     """
-    pairing, pose = associate(params, grid, window, unpaired(window), seed), seed
+    pairing, pose = find(params, grid, window, seed), seed
     for _ in range(ROUNDS):
         pose = refit(params, window, pairing, pose, seed[2])
         pairing = associate(params, grid, window, pairing, pose)
