@@ -56,7 +56,7 @@ def _spread(
 
     Neighbour by neighbour: summing a gathered `(2, m, b)` array takes seven times as long.
     """
-    weight, spread = 0.0, 0.0
+    weight, spread = jnp.zeros_like(mass[0]), jnp.zeros_like(mass)
     for b in range(grid.neighbour.shape[1]):
         kernel = jnp.exp(-0.5 * grid.neighbour_m2[:, b] / variance)
         weight = weight + kernel
