@@ -162,7 +162,7 @@ def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array
     return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
 
 
-@eqx.filter_jit
+@jax.jit
 def step(
     config: StreamConfig, tables: MapTables, state: StreamState, frame: Frame
 ) -> tuple[StreamState, StreamRecord]:
@@ -275,7 +275,7 @@ def step(
     return state, record
 
 
-@eqx.filter_jit
+@jax.jit
 def replay(
     config: StreamConfig, tables: MapTables, frames: Frame, state: StreamState | None = None
 ) -> tuple[StreamState, StreamRecord]:
