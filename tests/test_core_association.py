@@ -13,6 +13,8 @@ from taojax.core.association import (
     JointParams,
     JointWindow,
     associate,
+    evaluate,
+    find,
     joint_branch,
     look_up,
     objective,
@@ -27,9 +29,14 @@ M, N = 50, 10
 PLACES = loop(M)
 GRID = map_tables(PLACES).grid
 SPACING_M = float(map_tables(PLACES).spacing_m)
-half_a, half_b, value = (eqx.filter_jit(f) for f in (associate, refit, objective))
+start, half_a, half_b = (eqx.filter_jit(f) for f in (find, associate, refit))
 follow = eqx.filter_jit(jax.vmap(joint_branch, in_axes=(None, None, None, 0)))
-pools = eqx.filter_jit(jax.vmap(pool, in_axes=(None, None, 0)))
+pools = eqx.filter_jit(jax.vmap(pool, in_axes=(None, None, None, 0)))
+
+
+@eqx.filter_jit
+def value(params, window, pairing, pose, theta0):
+    return objective(params, window, evaluate(params, window, pairing, pose), pose, theta0)
 
 
 def scene(seed, noise=0.3):
@@ -48,7 +55,11 @@ def scene(seed, noise=0.3):
     # Arrays, not Python numbers: those would be compile-time constants.
     values = (rng.uniform(3, 20), 1.0, rng.uniform(0.01, 0.5))
     params = JointParams(*(jnp.asarray(v, jnp.float32) for v in values))
-    window = JointWindow(p, weight, rows, pools(grid, params.gamma, rows))
+    # Every anchor is listed, in an order that is not the map's.
+    listed = jnp.asarray(rng.permutation(M), jnp.int32)
+    rows = rows[:, listed]
+    pooled = pools(grid, params.gamma, listed, rows)
+    window = JointWindow(p, weight, jnp.broadcast_to(listed, (N, M)), rows, pooled)
     seed_pose = truth + jnp.asarray(rng.normal(0, [3, 3, 0.5]), jnp.float32)
     return params, grid, window, truth, seed_pose
 
@@ -57,14 +68,14 @@ def scene(seed, noise=0.3):
 @given(st.integers(0, 10**6), st.floats(0, 0.75, allow_subnormal=False))
 def test_no_half_step_raises_the_truncated_objective(seed, noise):
     params, grid, window, _, pose = scene(seed, noise)
-    theta0, anchor = pose[2], jnp.full(N, -1, jnp.int32)
-    before = float(value(params, grid, window, anchor, pose, theta0))
+    theta0, pairing = pose[2], start(params, grid, window, pose)
+    before = float(value(params, window, pairing, pose, theta0))
     for _ in range(4):
-        anchor = half_a(params, grid, window, anchor, pose)
-        middle = float(value(params, grid, window, anchor, pose, theta0))
+        pairing = half_a(params, grid, window, pairing, pose)
+        middle = float(value(params, window, pairing, pose, theta0))
         assert middle <= before + 1e-5
-        pose = half_b(params, grid, window, anchor, pose, theta0)
-        after = float(value(params, grid, window, anchor, pose, theta0))
+        pose = half_b(params, window, pairing, pose, theta0)
+        after = float(value(params, window, pairing, pose, theta0))
         assert after <= middle + 1e-5
         before = after
 
@@ -83,7 +94,19 @@ def test_a_branch_near_the_truth_ends_at_the_truth(seed):
 def test_the_cost_is_the_objective_at_the_end_and_bounded():
     params, grid, window, _, pose = scene(3)
     got = follow(params, grid, window, pose[None])
-    want = value(params, grid, window, got.anchor[0], got.T_map_odom[0], pose[2])
+    # Written out anew from the anchors alone.
+    similarity = np.zeros((N, M))
+    np.put_along_axis(similarity, np.asarray(window.listed), np.asarray(window.similarity), axis=1)
+    anchor, (x, y, theta) = np.asarray(got.anchor[0]), np.asarray(got.T_map_odom[0], float)
+    p, q = np.asarray(window.p, float), np.asarray(grid.xy, float)[anchor]
+    c, s = np.cos(theta), np.sin(theta)
+    r = np.hypot(*(q - np.c_[c * p[:, 0] - s * p[:, 1] + x, s * p[:, 0] + c * p[:, 1] + y]).T)
+    r = r / float(params.delta_m)
+    rho = np.where(r <= 1, 0.5 * r**2, r - 0.5)
+    each = rho + float(params.gamma) * (1 - similarity[np.arange(N), anchor])
+    each = np.minimum(float(params.gamma), np.where(anchor >= 0, each, np.inf))
+    prior = float(params.kappa) * (1 - np.cos(theta - float(pose[2])))
+    want = np.sum(np.asarray(window.weight) * each) + prior
     np.testing.assert_allclose(got.cost[0], want, rtol=1e-5)
     assert 0 <= float(got.cost[0]) <= params.gamma + 2 * params.kappa
 
@@ -112,6 +135,22 @@ def test_the_order_of_the_window_does_not_matter(rng):
     np.testing.assert_allclose(a.cost, b.cost, rtol=1e-5)
 
 
+@pytest.mark.parametrize("n_listed", [3, 20, M])
+def test_pooling_a_list_is_the_argmin_over_every_neighbourhood(n_listed, rng):
+    index = rng.permutation(M)[:n_listed]
+    similarity = rng.uniform(0, 1, n_listed).astype(np.float32)
+    index[1], similarity[2] = -1, 0.0
+    row = np.zeros(M + 1, np.float32)
+    row[index] = similarity
+    row[-1] = 0.0
+    neighbour = np.asarray(GRID.neighbour)
+    best = np.argmin(GRID.neighbour_cost + 1.0 - row[:-1][neighbour], axis=1)
+    want = neighbour[np.arange(M), best]
+    place = np.asarray(pool(GRID, 1.0, jnp.asarray(index), jnp.asarray(similarity))).astype(int)
+    got = np.where(place < n_listed, np.append(index, -1)[place], np.arange(M))
+    np.testing.assert_array_equal(got, want)
+
+
 def test_look_up_finds_the_nearest_anchor_within_a_cell(rng):
     grid = map_tables(loop(M)).grid
     xy = rng.uniform(-60, 60, (200, 2)).astype(np.float32)
@@ -132,7 +171,7 @@ def test_positions_far_outside_the_grid_have_no_anchor():
 
 DEGENERATE = {
     "standing still": lambda w: eqx.tree_at(lambda x: x.p, w, jnp.zeros_like(w.p)),
-    "no similarity": lambda w: eqx.tree_at(lambda x: x.rows, w, jnp.zeros_like(w.rows)),
+    "no similarity": lambda w: eqx.tree_at(lambda x: x.similarity, w, jnp.zeros_like(w.similarity)),
     "no weight": lambda w: eqx.tree_at(lambda x: x.weight, w, jnp.zeros_like(w.weight)),
     "far away": lambda w: eqx.tree_at(lambda x: x.p, w, w.p * 1e6),
 }

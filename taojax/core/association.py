@@ -18,8 +18,10 @@ Everything is written for one branch; `vmap` adds the others.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from taojax.core.cost import huber, squared_residuals
 from taojax.core.procrustes import AngleEvidence, fit_se2
@@ -37,6 +39,9 @@ class AnchorGrid(eqx.Module):
 
     theta: Float[Array, " m"]
     """Anchor headings [rad]."""
+
+    facing: Float[Array, "m 2"]
+    """The same as unit vectors."""
 
     nearest: Int[Array, " cells"]
     """Row-major grid: the anchor nearest to a cell's centre, -1 where none is in reach."""
@@ -83,11 +88,33 @@ class JointWindow(eqx.Module):
     weight: Float[Array, " n"]
     """Frame weights, summing to one; 0 for frames that are not there yet."""
 
-    rows: Float[Array, "n m"]
-    """Similarity of every anchor on the fixed scale: 0 background, 1 strong match."""
+    listed: Int[Array, "n c"]
+    """Anchors that each frame's list names; anything where its similarity is 0."""
 
-    pooled: Int[Array, "n m"]
-    """Best anchor in every anchor's neighbourhood, from `pool`."""
+    similarity: Float[Array, "n c"]
+    """Theirs on the fixed scale: 1 strong match, 0 background, as for every anchor not named."""
+
+    pooled: UInt[Array, "n m"]
+    """Place in the list of the best anchor in every anchor's neighbourhood, from `pool`."""
+
+
+class Pairing(eqx.Module):
+    """The anchor of each frame and what it costs at one alignment."""
+
+    anchor: Int[Array, " n"]
+    """-1 without one."""
+
+    q: Float[Array, "n 2"]
+    """Its position, map frame [m]."""
+
+    sim: Float[Array, " n"]
+    """Its similarity cost gamma (1 - s)."""
+
+    geom: Float[Array, " n"]
+    """Its residual cost rho_delta / delta^2, infinite without an anchor."""
+
+    r: Float[Array, " n"]
+    """Its residual [m]."""
 
 
 class JointBranch(eqx.Module):
@@ -116,104 +143,138 @@ class JointBranch(eqx.Module):
 
 
 def pool(
-    grid: AnchorGrid, gamma: float | Float[Array, ""], row: Float[Array, " m"]
-) -> Int[Array, " m"]:
+    grid: AnchorGrid,
+    gamma: float | Float[Array, ""],
+    index: Int[Array, " c"],
+    similarity: Float[Array, " c"],
+) -> UInt[Array, " m"]:
     """Name the best anchor in every anchor's neighbourhood, for one frame.
 
     Args:
         grid: the map.
         gamma: weight of similarity.
-        row: `(m,)` similarity of every anchor on the fixed scale.
+        index: `(c,)` anchors that the frame's list names, -1 = none.
+        similarity: `(c,)` theirs on the fixed scale.
 
     Returns:
-        `(m,)` anchors that minimise neighbour distance cost + gamma (1 - s).
+        `(m,)` places in the list of the anchors that minimise neighbour distance cost +
+        gamma (1 - s); c where that is the anchor itself, unlisted. A place fits in a byte where an
+        anchor needs four, and the stream remembers many of these rows.
     """
-    cost = grid.neighbour_cost + gamma * (1.0 - row[grid.neighbour])
-    best = jnp.argmin(cost, axis=1)
-    return jnp.take_along_axis(grid.neighbour, best[:, None], axis=1)[:, 0]
+    m, c = grid.xy.shape[0], index.shape[0]
+    listed = jnp.where(index >= 0, index, m)
+    place = jnp.full(m, c).at[listed].set(jnp.arange(c), mode="drop")
+    row = jnp.append(similarity, 0.0)[place]
+    # Neighbour by neighbour: an argmin over a gathered (m, b) array takes three times as long.
+    best, least = grid.neighbour[:, 0], jnp.inf
+    for b in range(grid.neighbour.shape[1]):
+        other = grid.neighbour[:, b]
+        cost = grid.neighbour_cost[:, b] + gamma * (1.0 - row[other])
+        best = jnp.where(cost < least, other, best)
+        least = jnp.minimum(cost, least)
+    return place[best].astype(np.min_scalar_type(c))
 
 
-def look_up(grid: AnchorGrid, xy: Float[Array, "n 2"]) -> Int[Array, " n"]:
+def look_up(grid: AnchorGrid, xy: Float[Array, "*n 2"]) -> Int[Array, "*n"]:
     """Return the anchor nearest to each position, -1 where none is in reach."""
-    cell = jnp.floor((xy - grid.corner[None, :]) / grid.cell_m)
-    is_on = jnp.all((cell >= 0) & (cell < grid.shape[None, :].astype(xy.dtype)), axis=-1)
+    x = jnp.floor((xy[..., 0] - grid.corner[0]) / grid.cell_m)
+    y = jnp.floor((xy[..., 1] - grid.corner[1]) / grid.cell_m)
+    width, height = grid.shape[0].astype(xy.dtype), grid.shape[1].astype(xy.dtype)
+    is_on = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     # Clip before the cast: a float beyond int32 has no defined integer.
-    inside = jnp.where(is_on[:, None], cell, 0.0).astype(jnp.int32)
-    return jnp.where(is_on, grid.nearest[inside[:, 0] * grid.shape[1] + inside[:, 1]], -1)
+    column = jnp.where(is_on, x, 0.0).astype(jnp.int32)
+    row = jnp.where(is_on, y, 0.0).astype(jnp.int32)
+    return jnp.where(is_on, grid.nearest[column * grid.shape[1] + row], -1)
 
 
-def _frame_costs(
-    params: JointParams,
-    grid: AnchorGrid,
-    window: JointWindow,
-    anchor: Int[Array, " n"],
-    pose: Float[Array, "3"],
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-    """Return residual cost, similarity cost and squared residual [m^2] of each frame."""
-    row = jnp.maximum(anchor, 0)
-    squared = squared_residuals(pose, window.p, grid.xy[row])
-    geom = huber(squared, params.delta_m) / params.delta_m**2
-    similarity = window.rows[jnp.arange(anchor.shape[0]), row]
+def evaluate(
+    params: JointParams, window: JointWindow, pairing: Pairing, pose: Float[Array, "3"]
+) -> Pairing:
+    """Return the same pairs with their residuals at another alignment."""
+    r = jnp.sqrt(squared_residuals(pose, window.p, pairing.q))
     # Without an anchor a frame must be truncated whatever its residual.
-    geom = jnp.where(anchor >= 0, geom, jnp.inf)
-    return geom, params.gamma * (1.0 - similarity), squared
+    geom = jnp.where(pairing.anchor >= 0, huber(r**2, params.delta_m), jnp.inf)
+    return Pairing(pairing.anchor, pairing.q, pairing.sim, geom / params.delta_m**2, r)
+
+
+def find(
+    params: JointParams, grid: AnchorGrid, window: JointWindow, pose: Float[Array, "3"]
+) -> Pairing:
+    """Return the best anchor near each frame's predicted position."""
+    near = look_up(grid, transform(pose[None], window.p))
+    row = jnp.maximum(near, 0)
+    frames, c = jnp.arange(near.shape[0]), window.listed.shape[1]
+    place = window.pooled[frames, row].astype(jnp.int32)
+    is_listed, place = place < c, jnp.minimum(place, c - 1)
+    anchor = jnp.where(is_listed, window.listed[frames, place], row)
+    similarity = jnp.where(is_listed, window.similarity[frames, place], 0.0)
+    found = Pairing(
+        anchor=jnp.where(near >= 0, anchor, -1),
+        q=grid.xy[anchor],
+        sim=params.gamma * (1.0 - similarity),
+        geom=jnp.zeros_like(similarity),
+        r=jnp.zeros_like(similarity),
+    )
+    return evaluate(params, window, found, pose)
 
 
 def associate(
     params: JointParams,
     grid: AnchorGrid,
     window: JointWindow,
-    anchor: Int[Array, " n"],
+    old: Pairing,
     pose: Float[Array, "3"],
-) -> Int[Array, " n"]:
+) -> Pairing:
     """Half step (a): give each frame the best anchor near its predicted position.
 
     The look-up is approximate, so the old anchor stays where it is cheaper.
     """
-    near = look_up(grid, transform(jnp.broadcast_to(pose, (*window.p.shape[:1], 3)), window.p))
-    frames = jnp.arange(near.shape[0])
-    found = jnp.where(near >= 0, window.pooled[frames, jnp.maximum(near, 0)], -1)
-    old_geom, old_sim, _ = _frame_costs(params, grid, window, anchor, pose)
-    new_geom, new_sim, _ = _frame_costs(params, grid, window, found, pose)
-    return jnp.where(old_geom + old_sim <= new_geom + new_sim, anchor, found)
+    new, old = find(params, grid, window, pose), evaluate(params, window, old, pose)
+    keeps = old.geom + old.sim <= new.geom + new.sim
+    return jax.tree.map(
+        lambda a, b: jnp.where(keeps if a.ndim == 1 else keeps[:, None], a, b), old, new
+    )
 
 
 def refit(
     params: JointParams,
-    grid: AnchorGrid,
     window: JointWindow,
-    anchor: Int[Array, " n"],
+    pairing: Pairing,
     pose: Float[Array, "3"],
     theta0: Float[Array, ""],
 ) -> Float[Array, "3"]:
     """Half step (b): solve the alignment again over the frames that found support.
 
+    Args:
+        params: weights.
+        window: what the frontend said.
+        pairing: evaluated at `pose`.
+        pose: the old alignment.
+        theta0: heading of the prior.
+
     Returns:
         The minimiser of the Huber majoriser (IRLS weights min(1, delta / r)) plus heading prior;
         the old pose where no frame has support.
     """
-    geom, sim, squared = _frame_costs(params, grid, window, anchor, pose)
-    is_inlier = geom + sim < params.gamma
-    r = jnp.sqrt(jnp.maximum(squared, params.delta_m**2))
-    weight = jnp.where(is_inlier, window.weight * params.delta_m / r, 0.0) / params.delta_m**2
+    is_inlier = pairing.geom + pairing.sim < params.gamma
+    r = jnp.maximum(pairing.r, params.delta_m)
+    weight = jnp.where(is_inlier, window.weight / (r * params.delta_m), 0.0)
     prior = AngleEvidence(
         params.kappa * jnp.cos(theta0), params.kappa * jnp.sin(theta0), jnp.asarray(params.kappa)
     )
-    fit = fit_se2(window.p, grid.xy[jnp.maximum(anchor, 0)], weight, prior)
+    fit = fit_se2(window.p, pairing.q, weight, prior)
     return jnp.where(fit.is_degenerate, pose, fit.T_map_odom)
 
 
 def objective(
     params: JointParams,
-    grid: AnchorGrid,
     window: JointWindow,
-    anchor: Int[Array, " n"],
+    pairing: Pairing,
     pose: Float[Array, "3"],
     theta0: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Return J, the truncated objective that both half steps can only lower."""
-    geom, sim, _ = _frame_costs(params, grid, window, anchor, pose)
-    truncated = jnp.minimum(params.gamma, geom + sim)
+    """Return J of a pairing evaluated at `pose`, which both half steps can only lower."""
+    truncated = jnp.minimum(params.gamma, pairing.geom + pairing.sim)
     return jnp.sum(window.weight * truncated) + params.kappa * (1.0 - jnp.cos(pose[2] - theta0))
 
 
@@ -231,21 +292,18 @@ def joint_branch(
     Returns:
         The branch after a fixed number of alternations; finite for every finite input.
     """
-    anchor = jnp.full(window.p.shape[:1], -1, jnp.int32)
-    pose = seed
+    pairing, pose = find(params, grid, window, seed), seed
     for _ in range(ROUNDS):
-        anchor = associate(params, grid, window, anchor, pose)
-        pose = refit(params, grid, window, anchor, pose, seed[2])
-    anchor = associate(params, grid, window, anchor, pose)
-    geom, sim, _ = _frame_costs(params, grid, window, anchor, pose)
-    is_inlier = (geom + sim < params.gamma) & (window.weight > 0)
+        pose = refit(params, window, pairing, pose, seed[2])
+        pairing = associate(params, grid, window, pairing, pose)
+    is_inlier = (pairing.geom + pairing.sim < params.gamma) & (window.weight > 0)
     supported = jnp.where(is_inlier, window.weight, 0.0)
     return JointBranch(
-        cost=objective(params, grid, window, anchor, pose, seed[2]),
-        geom=jnp.sum(supported * jnp.where(is_inlier, geom, 0.0)),
-        sim=jnp.sum(supported * sim),
+        cost=objective(params, window, pairing, pose, seed[2]),
+        geom=jnp.sum(supported * jnp.where(is_inlier, pairing.geom, 0.0)),
+        sim=jnp.sum(supported * pairing.sim),
         T_map_odom=pose,
-        anchor=anchor,
-        frame_cost=jnp.minimum(params.gamma, geom + sim),
+        anchor=pairing.anchor,
+        frame_cost=jnp.minimum(params.gamma, pairing.geom + pairing.sim),
         is_inlier=is_inlier,
     )

@@ -88,7 +88,7 @@ def squared_residuals(
     T_map_odom: Float[Array, "3"], p: Float[Array, "n 2"], q: Float[Array, "n 2"]
 ) -> Float[Array, " n"]:
     """Return |q - (R p + t)|^2 of each frame [m^2]."""
-    turned = rotate(jnp.broadcast_to(T_map_odom[2], p.shape[:1]), p)
+    turned = rotate(T_map_odom[2], p)
     return jnp.sum((q - turned - T_map_odom[None, :2]) ** 2, axis=-1)
 
 

@@ -1,7 +1,8 @@
 """Poses in the plane: `(x [m], y [m], theta [rad])`, theta in [-pi, pi].
 
 `T_a_b` takes coordinates in frame b to coordinates in frame a. Everything is written for one
-element and broadcasts over leading axes; rotations are spelled out, because a float32 matmul may
+element and broadcasts over leading axes (an angle given once is turned into sine and cosine once);
+rotations are spelled out, because a float32 matmul may
 run in TF32 on recent GPUs and lose centimetres over a 100 m lever arm.
 
 Source: Sola, Deray and Atchuthan, "A micro Lie theory", 2018, section on SE(2).
@@ -17,14 +18,14 @@ def wrap(theta: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.arctan2(jnp.sin(theta), jnp.cos(theta))
 
 
-def rotate(theta: Float[Array, "*b"], p: Float[Array, "*b 2"]) -> Float[Array, "*b 2"]:
+def rotate(theta: Float[Array, "*#b"], p: Float[Array, "*#b 2"]) -> Float[Array, "*b 2"]:
     """Turn points by an angle, counter-clockwise."""
     c, s = jnp.cos(theta), jnp.sin(theta)
     x, y = p[..., 0], p[..., 1]
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
-def transform(T_a_b: Float[Array, "*b 3"], p_b: Float[Array, "*b 2"]) -> Float[Array, "*b 2"]:
+def transform(T_a_b: Float[Array, "*#b 3"], p_b: Float[Array, "*#b 2"]) -> Float[Array, "*b 2"]:
     """Take points in frame b to frame a."""
     return rotate(T_a_b[..., 2], p_b) + T_a_b[..., :2]
 

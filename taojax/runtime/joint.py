@@ -3,11 +3,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from taojax.config import StreamConfig
 from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch, pool
-from taojax.core.se2 import compose, inverse
+from taojax.core.se2 import compose, inverse, transform
 from taojax.runtime.maps import MapTables
 
 GAMMA = 1.0
@@ -20,14 +21,17 @@ DISTINCT_DELTAS = 3.0
 class JointState(eqx.Module):
     """Memory of the joint branches: rings of fixed shape, addressed by `slot`."""
 
-    p: Float[Array, "n 3"]
-    """Local poses; the newest is the origin."""
+    p: Float[Array, "n 2"]
+    """Local positions; the newest is the origin."""
 
-    rows: Float[Array, "n m"]
-    """Similarity of every anchor, on the fixed scale."""
+    listed: Int[Array, "n c"]
+    """Anchors that the lists name, -1 = none."""
 
-    pooled: Int[Array, "n m"]
-    """Best anchor around every anchor."""
+    similarity: Float[Array, "n c"]
+    """Theirs, on the fixed scale."""
+
+    pooled: UInt[Array, "n m"]
+    """Place in the list of the best anchor around every anchor."""
 
     is_filled: Bool[Array, " n"]
     slot: Int[Array, ""]
@@ -61,11 +65,12 @@ class JointReading(eqx.Module):
 
 def init_joint(config: StreamConfig, n_anchors: int) -> JointState:
     """Return the memory before the first frame."""
-    n = config.joint_window
+    n, c = config.joint_window, config.branches
     return JointState(
-        p=jnp.zeros((n, 3)),
-        rows=jnp.zeros((n, n_anchors)),
-        pooled=jnp.zeros((n, n_anchors), jnp.int32),
+        p=jnp.zeros((n, 2)),
+        listed=jnp.full((n, c), -1, jnp.int32),
+        similarity=jnp.zeros((n, c)),
+        pooled=jnp.full((n, n_anchors), c, np.min_scalar_type(c)),
         is_filled=jnp.zeros(n, bool),
         slot=jnp.zeros((), jnp.int32),
         carried=jnp.zeros(3),
@@ -100,7 +105,7 @@ def joint_step(
     state: JointState,
     odometry: Float[Array, "3"],
     index: Int[Array, " c"],
-    scaled: Float[Array, " m"],
+    scaled: Float[Array, " c"],
 ) -> tuple[JointState, JointReading]:
     """Advance all joint branches by one frame.
 
@@ -110,21 +115,21 @@ def joint_step(
         state: memory.
         odometry: motion into this frame, finite.
         index: `(c,)` candidates, best first, -1 = none.
-        scaled: `(m,)` similarity of every anchor on the fixed scale.
+        scaled: `(c,)` their similarities on the fixed scale.
 
     Returns:
         The memory and the reading.
     """
     n, params = config.joint_window, joint_params(config, tables)
     slot = state.slot
-    motion = jnp.broadcast_to(inverse(odometry), state.p.shape)
-    p = compose(motion, state.p).at[slot].set(0.0)
-    rows = state.rows.at[slot].set(scaled)
-    pooled = state.pooled.at[slot].set(pool(tables.grid, GAMMA, scaled))
+    p = transform(inverse(odometry)[None], state.p).at[slot].set(0.0)
+    listed = state.listed.at[slot].set(index)
+    similarity = state.similarity.at[slot].set(scaled)
+    pooled = state.pooled.at[slot].set(pool(tables.grid, GAMMA, index, scaled))
     is_filled = state.is_filled.at[slot].set(True)
     age = jnp.mod(slot - jnp.arange(n), n)
     decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
-    window = JointWindow(p[:, :2], decay / jnp.sum(decay), rows, pooled)
+    window = JointWindow(p, decay / jnp.sum(decay), listed, similarity, pooled)
 
     carried = compose(state.carried, odometry)
     seeds = _seeds(config, tables, index, carried)
@@ -152,11 +157,12 @@ def joint_step(
     has_carried = state.has_carried | jnp.any(is_seed)
     state = JointState(
         p=p,
-        rows=rows,
+        listed=listed,
+        similarity=similarity,
         pooled=pooled,
         is_filled=is_filled,
         slot=jnp.mod(slot + 1, n),
         carried=best.T_map_odom,
         has_carried=has_carried,
     )
-    return state, JointReading(in_time, rival, has_carried, is_filled[order], p[order, :2])
+    return state, JointReading(in_time, rival, has_carried, is_filled[order], p[order])

@@ -71,6 +71,7 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
     return AnchorGrid(
         xy=jnp.asarray(xy, jnp.float32),
         theta=jnp.asarray(poses[:, 2], jnp.float32),
+        facing=jnp.asarray(np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], 1), jnp.float32),
         nearest=jnp.asarray(np.where(np.isfinite(distance), nearest, -1), jnp.int32),
         shape=jnp.asarray(shape, jnp.int32),
         corner=jnp.asarray(low, jnp.float32),

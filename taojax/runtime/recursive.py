@@ -8,9 +8,9 @@ scale; off the map nothing is expected. No number here is fitted.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from taojax.core.association import look_up
+from taojax.core.association import AnchorGrid, look_up
 from taojax.core.se2 import rotate
 from taojax.runtime.maps import MapTables
 
@@ -49,11 +49,27 @@ def init_recursive(n_anchors: int) -> RecursiveState:
     return RecursiveState(mass, jnp.full((), START_OFF, jnp.float32))
 
 
+def _spread(
+    grid: AnchorGrid, variance: Float[Array, ""], mass: Float[Array, "2 m"]
+) -> Float[Array, "2 m"]:
+    """Return the mass after positions spread over the neighbours.
+
+    Neighbour by neighbour: summing a gathered `(2, m, b)` array takes seven times as long.
+    """
+    weight, spread = jnp.zeros_like(mass[0]), jnp.zeros_like(mass)
+    for b in range(grid.neighbour.shape[1]):
+        kernel = jnp.exp(-0.5 * grid.neighbour_m2[:, b] / variance)
+        weight = weight + kernel
+        spread = spread + kernel[None] * mass[:, grid.neighbour[:, b]]
+    return spread / weight[None]
+
+
 def recursive_step(
     tables: MapTables,
     state: RecursiveState,
     odometry: Float[Array, "3"],
-    scaled: Float[Array, " m"],
+    index: Int[Array, " c"],
+    scaled: Float[Array, " c"],
 ) -> tuple[RecursiveState, Float[Array, ""]]:
     """Advance the belief by one frame.
 
@@ -61,7 +77,8 @@ def recursive_step(
         tables: the map.
         state: the belief.
         odometry: motion into this frame, finite.
-        scaled: `(m,)` similarity of every anchor on the fixed scale.
+        index: `(c,)` candidates, -1 = none.
+        scaled: `(c,)` their similarities on the fixed scale.
 
     Returns:
         The belief, and the probability of not being where the belief is strongest.
@@ -72,20 +89,19 @@ def recursive_step(
     # Half a spacing of doubt once the robot has moved half a spacing, and 15 % of the distance.
     doubt = 0.5 * spacing_m * jnp.minimum(1.0, driven / (0.5 * spacing_m))
     variance = doubt**2 + (0.1 * spacing_m) ** 2 + (0.15 * driven) ** 2
-    kernel = jnp.exp(-0.5 * grid.neighbour_m2 / variance)
-    kernel = kernel / jnp.sum(kernel, axis=1, keepdims=True)
-    spread = jnp.sum(kernel[None] * state.mass[:, grid.neighbour], axis=-1)
+    spread = _spread(grid, variance, state.mass)
 
-    facing = grid.theta[None] + jnp.array([[0.0], [jnp.pi]]) - odometry[2]
-    step = jnp.broadcast_to(odometry[:2], (2, m, 2))
-    before = (grid.xy[None] - rotate(facing, step)).reshape(2 * m, 2)
+    # Whoever faced the other way came from the other side.
+    facing = rotate(-odometry[2], grid.facing)
+    ahead, left = odometry[0], odometry[1]
+    step = ahead * facing + left * jnp.stack([-facing[:, 1], facing[:, 0]], axis=1)
+    before = jnp.stack([grid.xy - step, grid.xy + step])
     source = look_up(grid, before)
     known = jnp.maximum(source, 0)
-    gap = jnp.sum((grid.xy[known] - before) ** 2, axis=1)
-    is_linked = ((source >= 0) & (gap < (REACH_SPACINGS * spacing_m) ** 2)).reshape(2, m)
-    known = known.reshape(2, m)
+    gap = jnp.sum((grid.xy[known] - before) ** 2, axis=-1)
+    is_linked = (source >= 0) & (gap < (REACH_SPACINGS * spacing_m) ** 2)
     # A loop driven the other way later has anchors that face against their neighbours.
-    is_same = jnp.cos(grid.theta[known] - (grid.theta[None] - odometry[2])) >= 0
+    is_same = jnp.sum(grid.facing[known] * facing[None], axis=-1) >= 0
     direction = jnp.array([[0], [1]])
     arriving = spread[jnp.where(is_same, direction, 1 - direction), known]
     arriving = jnp.where(is_linked, (1.0 - LEAK) * arriving, 0.0)
@@ -93,7 +109,10 @@ def recursive_step(
     off = STAY_OFF * state.off + gone
     mass = arriving + (1.0 - STAY_OFF) * state.off / (2 * m)
 
-    mass = mass * jnp.exp(EVIDENCE * scaled)[None]
+    # An anchor that the list lacks looks like background, whose evidence is 1.
+    listed = jnp.where(index >= 0, index, m)
+    evidence = jnp.ones(m).at[listed].set(jnp.exp(EVIDENCE * scaled), mode="drop")
+    mass = mass * evidence[None]
     total = jnp.sum(mass) + off
     mass, off = mass / total, off / total
     anywhere = jnp.sum(mass, axis=0)

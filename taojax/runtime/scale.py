@@ -57,15 +57,15 @@ def map_scale(descriptors: np.ndarray) -> np.ndarray:
     return np.array([background, strong])
 
 
-def rescale(scale: Float[Array, "2"], row: Float[Array, " m"]) -> Float[Array, " m"]:
+def rescale(scale: Float[Array, "2"], similarity: Float[Array, " c"]) -> Float[Array, " c"]:
     """Put one frame's similarities on the fixed scale.
 
     Args:
         scale: `(2,)` background and strong similarity.
-        row: `(m,)` raw similarities; NaN = not among the candidates.
+        similarity: `(c,)` raw.
 
     Returns:
-        `(m,)` values in [0, 1]; 0 for anchors not listed.
+        `(c,)` values in [0, 1].
     """
-    scaled = (row - scale[0]) / jnp.maximum(scale[1] - scale[0], LEAST_RANGE)
-    return jnp.where(jnp.isnan(row), 0.0, jnp.clip(scaled, 0.0, 1.0))
+    scaled = (similarity - scale[0]) / jnp.maximum(scale[1] - scale[0], LEAST_RANGE)
+    return jnp.clip(scaled, 0.0, 1.0)

@@ -20,7 +20,7 @@ from taojax.core.cost import (
     huber,
 )
 from taojax.core.procrustes import diagnose
-from taojax.core.se2 import compose, inverse
+from taojax.core.se2 import inverse, transform
 from taojax.runtime import signals
 from taojax.runtime.answer import (
     FRESH_FRAMES,
@@ -67,8 +67,8 @@ class StreamState(eqx.Module):
     pose anyway, and the shift keeps time order for the velocity term.
     """
 
-    p: Float[Array, "n 3"]
-    """Local poses of the window; the newest is the origin, so float32 stays exact."""
+    p: Float[Array, "n 2"]
+    """Local positions of the window; the newest is the origin, so float32 stays exact."""
 
     q: Float[Array, "n k 2"]
     """Rank anchors."""
@@ -123,7 +123,7 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
     """Return the state before the first frame on this map."""
     n, k = config.window, config.branches
     return StreamState(
-        p=jnp.zeros((n, 3)),
+        p=jnp.zeros((n, 2)),
         q=jnp.zeros((n, k, 2)),
         similarity=jnp.zeros((n, k)),
         has_anchor=jnp.zeros((n, k), bool),
@@ -162,17 +162,7 @@ def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array
     return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
 
 
-def _spread(tables: MapTables, index: Array, similarity: Array) -> Array:
-    """Return the similarity of every map image; NaN where the list lacks it.
-
-    The list is enough: with 100 candidates no recording told the whole row apart from it.
-    """
-    m = tables.grid.xy.shape[0]
-    listed = jnp.where(index >= 0, index, m)
-    return jnp.full(m, jnp.nan).at[listed].set(similarity, mode="drop")
-
-
-@eqx.filter_jit
+@jax.jit
 def step(
     config: StreamConfig, tables: MapTables, state: StreamState, frame: Frame
 ) -> tuple[StreamState, StreamRecord]:
@@ -194,8 +184,7 @@ def step(
     odometry, index, similarity = _clean(config, tables, frame)
     is_there = index >= 0
     anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
-    motion = jnp.broadcast_to(inverse(odometry), state.p.shape)
-    p = _push(compose(motion, state.p), jnp.zeros_like(odometry))
+    p = _push(transform(inverse(odometry)[None], state.p), jnp.zeros(2))
     q, s = _push(state.q, anchors), _push(state.similarity, similarity)
     has_anchor = _push(state.has_anchor, is_there)
     is_filled = _push(state.is_filled, jnp.ones((), bool))
@@ -204,13 +193,13 @@ def step(
 
     params = cost_params(config, tables)
     branches = Branch(jnp.swapaxes(q, 0, 1), s.T, has_anchor.T)
-    costs = jax.vmap(branch_cost, in_axes=(None, None, 0, None))(params, p[:, :2], branches, weight)
+    costs = jax.vmap(branch_cost, in_axes=(None, None, 0, None))(params, p, branches, weight)
     cheapest: BranchCost = jax.tree.map(lambda leaf: leaf[jnp.argmin(costs.total)], costs)
     # The signal is the minimum over all branches; a pose needs a candidate in the newest frame.
     has_candidates = jnp.any(is_there)
     rank = jnp.argmin(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
     best: BranchCost = jax.tree.map(lambda leaf: leaf[rank], costs)
-    shape = diagnose(p[:, :2], q[:, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
+    shape = diagnose(p, q[:, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
 
     n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *signals.WINDOWS))
     history = _push(state.top1, signals.top1(similarity))
@@ -230,10 +219,9 @@ def step(
         terms["recursive"] = signals.top1(similarity)
         answer = rank_answer(best, is_filled, index[rank], has_candidates)
     else:
-        row = _spread(tables, index, similarity)
-        scaled = rescale(tables.scale, row)
+        scaled = rescale(tables.scale, similarity)
         joint, reading = joint_step(config, tables, state.memory.joint, odometry, index, scaled)
-        belief, elsewhere = recursive_step(tables, state.memory.recursive, odometry, scaled)
+        belief, elsewhere = recursive_step(tables, state.memory.recursive, odometry, index, scaled)
         memory = Memory(joint, belief)
         terms = joint_terms(config, params.delta_m, tables, reading) | {"recursive": elsewhere}
         answer = joint_answer(tables, reading)
@@ -287,7 +275,7 @@ def step(
     return state, record
 
 
-@eqx.filter_jit
+@jax.jit
 def replay(
     config: StreamConfig, tables: MapTables, frames: Frame, state: StreamState | None = None
 ) -> tuple[StreamState, StreamRecord]:
