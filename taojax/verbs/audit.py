@@ -1,0 +1,94 @@
+"""`taojax audit`: the main job."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from taojax.errors import InputError, UsageError
+from taojax.verbs.common import (
+    SCENARIOS,
+    Common,
+    Scenario,
+    config_of,
+    flag,
+    out_of,
+    say,
+    score_apart,
+)
+
+if TYPE_CHECKING:
+    from taojax.config import Config
+
+
+@dataclasses.dataclass(frozen=True)
+class Audit(Common):
+    """The main job: score, seal, label, calibrate, measure, report.
+
+    Without DATASET it runs on the built-in simulated KAIST-like world, in its four scenarios.
+
+    Example: taojax audit my_data --r-in 5 --r-out 10
+    """
+
+    dataset: Annotated[
+        Path | None, tyro.conf.Positional, flag("DATASET", "the simulated world")
+    ] = None
+    """Data folder with truth/, laid out as data_specs/README.md says."""
+
+    scenario: Annotated[Scenario | None, flag("full|default|h3|h4", "all four")] = None
+    """Run one scenario of the simulated world alone."""
+
+
+def run(args: Audit) -> None:
+    """Audit a data folder or the simulated world."""
+    if args.dataset is not None and args.scenario is not None:
+        raise UsageError("--scenario names a part of the simulated world; drop it or DATASET")
+    config = config_of(args)
+    out = out_of(args, "audit", config)
+    if args.dataset is not None:
+        _audit_folder(args.dataset, out, config, progress=args.progress)
+    else:
+        _audit_world(args.scenario, out, config, progress=args.progress)
+
+
+def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool) -> None:
+    from taojax.records import refuse_if_taken
+
+    refuse_if_taken(out)
+    truth = dataset / "truth" / "query_poses.csv"
+    if dataset.is_dir() and not truth.is_file():
+        raise InputError(f"{truth}: no such file; add it, or run `taojax score` without truth")
+    score_apart(dataset, out, config, progress=progress)
+    from taojax.audit.evaluate import evaluate
+
+    evaluation = evaluate(out, dataset / "truth", config)
+    print("\n".join(evaluation.sentences))
+    say(f"report: {out}/report.html")
+
+
+def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress: bool) -> None:
+    from taojax.datasets.edit import scenario
+    from taojax.datasets.simulate import WorldConfig, make_world
+    from taojax.datasets.world import write_world
+    from taojax.records import refuse_if_taken
+
+    refuse_if_taken(out)
+    say("simulating the KAIST-like world")
+    world = make_world(WorldConfig(), config.seed)
+    evaluations = {}
+    for name in (only,) if only else SCENARIOS:
+        folder = out / "data" / name
+        write_world(scenario(world, name), folder)
+        say(f"scoring scenario {name} (simulated)")
+        score_apart(folder, out / name, config, progress=progress)
+    from taojax.audit.evaluate import evaluate
+    from taojax.audit.report import write_summary
+
+    for name in (only,) if only else SCENARIOS:
+        say(f"judging scenario {name} (simulated)")
+        evaluations[name] = evaluate(out / name, out / "data" / name / "truth", config)
+    command = " ".join(["taojax", *sys.argv[1:]])
+    print("\n".join(write_summary(out, evaluations, command=command)))
+    say(f"report: {out}/report.html")

@@ -1,0 +1,108 @@
+"""What the verbs share: flags, where a run goes, and scoring in a fresh process."""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from taojax.errors import ConfigError, UsageError
+
+if TYPE_CHECKING:
+    from taojax.config import Config
+
+Scenario = Literal["full", "default", "h3", "h4"]
+SCENARIOS: tuple[Scenario, ...] = ("full", "default", "h3", "h4")
+
+
+def flag(metavar: str, default: str) -> Any:
+    """Return how a flag shows in --help when its default is 'as the config file says'."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+Dataset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Common:
+    """Flags shared by the verbs; each wins over the config file."""
+
+    out: Annotated[Path | None, flag("DIR", "runs/<verb>/<time>-<config hash>")] = None
+    """Folder to make."""
+
+    config: Annotated[Path | None, flag("FILE.toml", "built-in settings")] = None
+    """Settings, such as the config.toml of an earlier run."""
+
+    r_in: Annotated[float | None, flag("M", "10")] = None
+    """In-map radius: truth within it of a map pose, metres."""
+
+    r_out: Annotated[float | None, flag("M", "10, at least r-in")] = None
+    """Map-out radius: truth beyond it of every map pose, metres."""
+
+    window: Annotated[int | None, flag("N", "20")] = None
+    """Frames remembered."""
+
+    branches: Annotated[int | None, flag("K", "100")] = None
+    """Hypotheses per frame."""
+
+    association: Annotated[Literal["rank", "joint"] | None, flag("rank|joint", "joint")] = None
+    """What a branch of the signal tao is."""
+
+    seed: Annotated[int | None, flag("INT", "0")] = None
+    """Seed of the simulated world and of the bootstrap."""
+
+    progress: bool = True
+    """Draw progress bars."""
+
+
+def say(text: str) -> None:
+    """Tell the user something that is not the result."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def config_of(args: Common, base: Path | None = None) -> "Config":
+    """Return the settings of the config file, of `base` or the defaults, with the flags on top."""
+    from taojax import config as settings
+
+    path = args.config or base
+    config = settings.from_toml(path) if path else settings.Config()
+    names = ("window", "branches", "association", "seed")
+    flags = {name: getattr(args, name) for name in names}
+    flags |= {"r_in_m": args.r_in, "r_out_m": args.r_out}
+    if args.r_in is not None and args.r_out is None:
+        flags["r_out_m"] = max(args.r_in, config.audit.r_out_m)
+    try:
+        return settings.replace(config, flags)
+    except ConfigError as error:
+        raise UsageError(f"flag {error}") from error
+
+
+def out_of(args: Common, verb: str, config: "Config") -> Path:
+    """Return the folder of this run."""
+    from taojax.config import to_toml
+
+    if args.out is not None:
+        return args.out
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    return (
+        Path("runs") / verb / f"{stamp}-{hashlib.sha256(to_toml(config).encode()).hexdigest()[:8]}"
+    )
+
+
+def score_apart(dataset: Path, out: Path, config: "Config", *, progress: bool) -> None:
+    """Score in a fresh interpreter: one in which the judge has never been imported."""
+    from taojax.config import to_toml
+
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "config.toml"
+        path.write_text(to_toml(config), encoding="utf-8")
+        flag = "--progress" if progress else "--no-progress"
+        words = ["score", str(dataset), "--out", str(out), "--config", str(path), flag]
+        done = subprocess.run([sys.executable, "-m", "taojax", *words], check=False)
+    if done.returncode:
+        raise SystemExit(done.returncode)

@@ -1,0 +1,35 @@
+"""`taojax score`: the robot side alone."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taojax.verbs.common import Common, Dataset, config_of, flag, out_of, say
+
+
+@dataclasses.dataclass(frozen=True)
+class Score(Common):
+    """Run time only: score a data folder and seal signals.csv. Needs no truth.
+
+    Example: taojax score my_data --out runs/mine
+    """
+
+    dataset: Dataset = tyro.MISSING
+    """Data folder, laid out as data_specs/README.md says."""
+
+    calibration: Annotated[Path | None, flag("FILE.toml", "no verdicts at run time")] = None
+    """calibration.toml of an audited run: adds decisions.csv, verdicts at frozen numbers."""
+
+
+def run(args: Score) -> None:
+    """Score a data folder and seal the result."""
+    from taojax.detector import from_toml
+    from taojax.runtime.score import score
+
+    config = config_of(args)
+    out = out_of(args, "score", config)
+    detector = None if args.calibration is None else from_toml(args.calibration)
+    manifest = score(args.dataset, out, config, detector=detector, progress=args.progress)
+    say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
