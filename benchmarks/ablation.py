@@ -35,14 +35,14 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 def _one_direction(*args: Any) -> jax.Array:
     seeds = _SEEDS(*args)
-    n = (len(seeds) - 1) // 2
+    n = (len(seeds) - 2) // 2
     # The reversed half repeats the forward half, so that every shape stays.
     return seeds.at[n : 2 * n].set(seeds[:n])
 
 
 def _nothing_carried(*args: Any) -> jax.Array:
     seeds = _SEEDS(*args)
-    return seeds.at[-1].set(seeds[0])
+    return seeds.at[-2:].set(seeds[0])
 
 
 _SEEDS = joint._seeds
@@ -72,9 +72,9 @@ def _cell(signal: np.ndarray, field: Field) -> str:
     return f"{metrics.auroc(values, is_out):.3f} / {metrics.far_at_95(values, is_out):.2f}"
 
 
-def _test_cell(columns: dict[str, np.ndarray], field: Field) -> str:
+def _test_cell(columns: dict[str, np.ndarray], field: Field, recall: float) -> str:
     splits = field.split(columns)
-    model = calibration.fit(splits.calibration)
+    model = calibration.fit(splits.calibration, recall)
     known = splits.test.is_in | splits.test.is_out
     p = detector.probability(model, splits.test.signals)[known]
     return f"{metrics.auroc(p, splits.test.is_out[known]):.3f}"
@@ -90,6 +90,7 @@ def _rows(data: DataSet) -> dict[str, str]:
     audit = AuditConfig(r_in_m=data.r_in_m, r_out_m=data.r_out_m)
     field = field_of(data, Config(audit=audit))
     full, rows = _columns(data, StreamConfig()), {}
+    recall = float(map_tables(data.map_poses, None, data.map_descriptors).recall)
     for name, settings in SETTINGS.items():
         columns = full if not settings else _columns(data, StreamConfig(**settings))
         rows[f"tao: {name}"] = _cell(columns["tao"], field)
@@ -97,11 +98,11 @@ def _rows(data: DataSet) -> dict[str, str]:
     for name, swap in SWAPS.items():
         with _swapped(*swap):
             rows[f"tao: {name}"] = _cell(_columns(data, StreamConfig())["tao"], field)
-    rows["probability, test half: all parts"] = _test_cell(full, field)
-    for name in calibration.PRIOR:
+    rows["probability, test half: all parts"] = _test_cell(full, field, recall)
+    for name in calibration.DISTINCT:
         # A constant column says nothing: the part is gone, the fit is the same.
         without = full | {name: np.zeros_like(full[name])}
-        rows[f"probability, test half: without {name}"] = _test_cell(without, field)
+        rows[f"probability, test half: without {name}"] = _test_cell(without, field, recall)
     return rows
 
 

@@ -19,6 +19,7 @@ from taojax.baselines.sequence import seqslam, sue
 from taojax.baselines.topometric import TopometricParams, topometric
 from taojax.baselines.trajectory_prior import trajectory_prior
 from taojax.config import Config, StreamConfig
+from taojax.core.adaptive import adaptive_mean
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.scale import LEAST_RANGE
 from taojax.runtime.score import replay_log
@@ -160,7 +161,7 @@ def oracle_alignment(data: DataSet, config: StreamConfig, tables: MapTables) -> 
     """Return the joint cost at the true alignment, whatever its branches found.
 
     In every frame of the window the best anchor about the true place is taken: truncated Huber
-    cost of its distance plus 1 - similarity on the fixed scale, under the joint window's weights.
+    cost of its distance plus 1 - similarity on the fixed scale, with the adaptive memory of `tao`.
     """
     n_map = len(data.map_poses)
     low, high = np.asarray(tables.scale, float)
@@ -173,9 +174,12 @@ def oracle_alignment(data: DataSet, config: StreamConfig, tables: MapTables) -> 
     r = np.hypot(gap[..., 0], gap[..., 1]) / delta
     residual = np.where(r <= 1.0, 0.5 * r**2, r - 0.5)
     cost = np.minimum(1.0, (residual + 1.0 - rows[:, :n_map]).min(axis=1))
-    weight = np.exp(-np.arange(config.joint_window) / float(config.memory_frames))
-    n = len(cost)
-    return np.convolve(cost, weight)[:n] / np.convolve(np.ones(n), weight)[:n]
+    n = config.joint_window
+    padded = np.concatenate([np.zeros(n - 1), cost])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, n)[:, ::-1]
+    is_filled = np.arange(n)[None] <= np.arange(len(cost))[:, None]
+    means = jax.vmap(adaptive_mean)(jnp.asarray(windows, jnp.float32), jnp.asarray(is_filled))
+    return np.asarray(means, float)
 
 
 def oracle_levels(top1: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -202,7 +206,7 @@ def _ours(data: DataSet, field: Field, run: tuple[StreamRecord, MapTables, float
         for name in OURS
         if name in columns
     ]
-    model = calibration.fit(field.split(columns).calibration)
+    model = calibration.fit(field.split(columns).calibration, float(run[1].recall))
     probability = detector.probability(model, columns)
     more = _timed(lambda: detector.probability(model, columns), len(data.odometry))
     return [*found, Entry(FUSED, "ours", log_odds(probability), place, us + more)]

@@ -9,17 +9,21 @@ import traceback
 import tyro
 
 from taojax.errors import ConfigError, InputError, MissingExtraError, TaojaxError, UsageError
-from taojax.verbs import audit, evaluate, score, simulate
+from taojax.verbs import audit, evaluate, kidnap, score, simulate, sweep
 from taojax.verbs.common import say
 
 ABOUT = "Am I lost, or just somewhere new, and may this loop closure enter my graph?"
 EXIT_CODES = {UsageError: 2, InputError: 3, ConfigError: 3, MissingExtraError: 4}
-Verb = audit.Audit | score.Score | evaluate.Evaluate | simulate.Simulate
+Verb = (
+    audit.Audit | score.Score | evaluate.Evaluate | simulate.Simulate | kidnap.Kidnap | sweep.Sweep
+)
 RUN = {
     audit.Audit: audit.run,
     score.Score: score.run,
     evaluate.Evaluate: evaluate.run,
     simulate.Simulate: simulate.run,
+    kidnap.Kidnap: kidnap.run,
+    sweep.Sweep: sweep.run,
 }
 
 

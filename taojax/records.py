@@ -9,7 +9,7 @@ import secrets
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,23 @@ from taojax.specs import load_spec, read_bytes, read_npz, read_table, table_text
 SCHEMA = 1
 SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
 """Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
+
+
+CARRIED = ("decisions.csv", "tracks.npz")
+"""Sealed like the others where they were asked for."""
+
+
+class SealedTrack(NamedTuple):
+    """What a rival says of every frame."""
+
+    signal: np.ndarray
+    """(T,) larger = more likely off the map; NaN where it was not run."""
+
+    pose: np.ndarray
+    """(T, 3) x [m], y [m], theta [rad]; zero without one."""
+
+    has_pose: np.ndarray
+    """(T,) bool."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +59,9 @@ class Run:
 
     manifest: dict[str, Any]
     """What was run, on what, with which code."""
+
+    tracks: dict[str, SealedTrack] | None = None
+    """Rivals by name; None where they were not asked for."""
 
 
 def signal_names() -> tuple[str, ...]:
@@ -110,6 +130,12 @@ def publish(out: Path, files: Mapping[str, bytes]) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
+def _archive(**arrays: np.ndarray) -> bytes:
+    held = io.BytesIO()
+    np.savez_compressed(held, allow_pickle=False, **arrays)
+    return held.getvalue()
+
+
 def write_run(  # noqa: PLR0913 - one argument per sealed thing
     out: Path,
     *,
@@ -120,6 +146,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     config_toml: str,
     manifest: Mapping[str, Any],
     decisions: Mapping[str, np.ndarray] | None = None,
+    tracks: Mapping[str, SealedTrack] | None = None,
 ) -> dict[str, Any]:
     """Seal one run.
 
@@ -132,6 +159,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
         config_toml: resolved settings.
         manifest: facts about the run; `sha256` may already hold hashes of the inputs.
         decisions: columns of data_specs/decisions.toml where a calibration was carried along.
+        tracks: rivals by name, where they were asked for.
 
     Returns:
         The manifest as sealed.
@@ -139,18 +167,23 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     Raises:
         InputError: `out` is taken or unwritable, or a signal is not finite.
     """
-    archive = io.BytesIO()
-    np.savez_compressed(
-        archive, index=index.astype(np.int32), similarity=similarity.astype(np.float32)
-    )
     files = {
         "config.toml": config_toml.encode(),
         "map_poses.csv": table_text("map_poses", map_poses).encode(),
-        "retrievals.npz": archive.getvalue(),
+        "retrievals.npz": _archive(
+            index=index.astype(np.int32), similarity=similarity.astype(np.float32)
+        ),
         "signals.csv": table_text("signals", signals).encode(),
     }
     if decisions is not None:
         files["decisions.csv"] = table_text("decisions", decisions).encode()
+    if tracks is not None:
+        files["tracks.npz"] = _archive(
+            signal=np.stack([t.signal for t in tracks.values()]).astype(np.float32),
+            pose=np.stack([t.pose for t in tracks.values()]).astype(np.float32),
+            has_pose=np.stack([t.has_pose for t in tracks.values()]).astype(np.uint8),
+        )
+        manifest = {**manifest, "tracks": list(tracks)}
     hashes = dict(manifest.get("sha256", {})) | {name: digest(raw) for name, raw in files.items()}
     sealed = {"schema": SCHEMA, **manifest, "sha256": hashes}
     sealed["seal"] = _seal(sealed)
@@ -180,6 +213,12 @@ def read_manifest(run: Path) -> dict[str, Any]:
     return manifest
 
 
+def _read_tracks(path: Path, names: list[str]) -> dict[str, SealedTrack]:
+    arrays = read_npz(path, "tracks")
+    parts = zip(arrays["signal"], arrays["pose"], arrays["has_pose"].astype(bool), strict=True)
+    return {name: SealedTrack(*part) for name, part in zip(names, parts, strict=True)}
+
+
 def read_run(run: Path) -> Run:
     """Read a sealed run, or refuse if a byte has changed since.
 
@@ -187,7 +226,7 @@ def read_run(run: Path) -> Run:
         InputError: a sealed file is missing, changed or malformed.
     """
     manifest = read_manifest(run)
-    carried = [name for name in ("decisions.csv",) if name in manifest["sha256"]]
+    carried = [name for name in CARRIED if name in manifest["sha256"]]
     for name in (*SEALED, *carried):
         want, got = manifest["sha256"].get(name), digest_file(run / name)
         if got != want:
@@ -201,4 +240,7 @@ def read_run(run: Path) -> Run:
         similarity=arrays["similarity"],
         config_toml=(run / "config.toml").read_text(encoding="utf-8"),
         manifest=manifest,
+        tracks=_read_tracks(run / "tracks.npz", manifest["tracks"])
+        if "tracks.npz" in carried
+        else None,
     )

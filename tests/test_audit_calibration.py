@@ -11,7 +11,7 @@ from taojax.errors import InputError
 
 def frames(rng, n_in, n_out, *, shift=3.0):
     is_out = np.r_[np.zeros(n_in, bool), np.ones(n_out, bool)]
-    signals = {name: rng.normal(size=n_in + n_out) for name in calibration.PRIOR}
+    signals = {name: rng.normal(size=n_in + n_out) for name in calibration.DISTINCT}
     for name in ("top1_w5", "tao"):
         signals[name] = signals[name] + shift * is_out
     return signals, np.where(is_out, "map_out", "in_map")
@@ -91,7 +91,7 @@ def test_too_few_frames_of_a_class_give_a_fallback_that_says_so(rng, n_out):
 def test_without_labels_the_weights_are_the_prior_and_there_is_no_threshold(rng):
     signals, _ = frames(rng, 20, 20)
     model = calibration.fit(split_of(signals, np.full(40, "grey")))
-    np.testing.assert_allclose(model.weight, list(calibration.PRIOR.values()))
+    np.testing.assert_allclose(model.weight, list(calibration.prior(calibration.LIST_RECALL).values()))
     assert np.isnan(model.threshold)
 
 
@@ -99,7 +99,7 @@ def test_labels_pull_the_weights_away_from_a_prior_that_is_wrong(rng):
     signals, label = frames(rng, 200, 200, shift=0.0)
     signals["tao"] = -3.0 * (label == "map_out") + rng.normal(size=400)
     model = calibration.fit(split_of(signals, label))
-    assert model.weight[list(calibration.PRIOR).index("tao")] < 0
+    assert model.weight[list(calibration.DISTINCT).index("tao")] < 0
 
 
 def test_perfect_promises_have_no_calibration_error():

@@ -17,7 +17,7 @@ HEADER = "t_s,x_m,y_m,theta_rad\n"
 
 def cut(n=20, gap=3, share=0.5):
     label = np.where(np.arange(n) % 4 == 3, "map_out", "in_map")
-    signals = {name: np.arange(float(n)) for name in calibration.PRIOR}
+    signals = {name: np.arange(float(n)) for name in calibration.DISTINCT}
     return labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
 
 

@@ -8,16 +8,32 @@ from jaxtyping import Float, Int
 from taojax.audit.labels import CalibrationSplit
 from taojax.detector import Detector, probability
 
-PRIOR = {
+BLURRED = {
     "top1_w5": 0.45,
     "tao": 0.9,
     "tao_window": 0.6,
-    "recursive": 0.65,
+    "recursive": 0.3,
     "tao_rival": -0.3,
+    "entropy": 0.0,
 }
-"""Signal -> log odds per standard deviation before any label is seen. Similarity level, aligned
-evidence with an adaptive and with a long memory, the recursive filter, and ambiguity: several
-equally good places speak for being off the map."""
+"""Signal -> log odds per standard deviation before any label is seen, for a map whose own images
+are taken for one another half of the time. Similarity level, aligned evidence with an adaptive and
+with a long memory, the recursive filter, and ambiguity: several equally good places speak for being
+off the map."""
+
+DISTINCT = {
+    "top1_w5": 0.3,
+    "tao": 0.9,
+    "tao_window": 0.6,
+    "recursive": 1.2,
+    "tao_rival": -0.3,
+    "entropy": 0.4,
+}
+"""The same for a map that tells all its places apart: there a filter that adds up the answers of
+every frame, and a list that agrees with itself, can be believed."""
+
+LIST_RECALL = 0.75
+"""What is taken for the map's recall where a run does not say."""
 
 PRIOR_PRECISION = 10.0
 """How firmly the weights hold to the prior; one labelled effective frame weighs about 1/4."""
@@ -36,28 +52,39 @@ LEAST_PER_CLASS = 5
 """Frames of each class below which the model is called a fallback."""
 
 
+def prior(map_recall: float) -> dict[str, float]:
+    """Return the prior weights that the map alone suggests.
+
+    Args:
+        map_recall: share of map images whose most similar other image lies nearby.
+    """
+    share = float(np.clip(2.0 * map_recall - 1.0, 0.0, 1.0))
+    return {name: (1.0 - share) * BLURRED[name] + share * DISTINCT[name] for name in DISTINCT}
+
+
 def _note(n_in: int, n_out: int) -> str:
     counts = f"{n_in} in-map and {n_out} map-out calibration frames"
     if min(n_in, n_out) >= LEAST_PER_CLASS:
         return (
-            f"The probability is a logistic model over {len(PRIOR)} signals, shrunk to a fixed "
-            f"prior and fitted on {counts}."
+            f"The probability is a logistic model over {len(DISTINCT)} signals, shrunk to a "
+            f"prior that the map alone sets, and fitted on {counts}."
         )
     return (
         f"The probability is a fallback, because there are only {counts} and two classes of at "
-        f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the fixed prior's, so "
+        f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the prior's, so "
         "it ranks frames, but its level is not calibrated."
     )
 
 
-def fit(calibration: CalibrationSplit) -> Detector:
-    """Fit the probability of being map-out: logistic, shrunk to a fixed prior.
+def fit(calibration: CalibrationSplit, map_recall: float = LIST_RECALL) -> Detector:
+    """Fit the probability of being map-out: logistic, shrunk to a prior made from the map alone.
 
     Location and scale of each signal come from all calibration frames, labelled or not; with one
     class, or a handful of frames, the prior decides.
 
     Args:
         calibration: frames that may be fitted on; grey ones give scale but no label.
+        map_recall: how far the map tells its own places apart; sealed in the run's manifest.
 
     Returns:
         The detector. Its threshold is the level that accepts 95 % of the in-map calibration
@@ -65,7 +92,8 @@ def fit(calibration: CalibrationSplit) -> Detector:
     """
     from scipy.optimize import minimize
 
-    x = np.stack([np.asarray(calibration.signals[name], float) for name in PRIOR], axis=1)
+    weights = prior(map_recall)
+    x = np.stack([np.asarray(calibration.signals[name], float) for name in weights], axis=1)
     mean, spread = x.mean(axis=0), x.std(axis=0)
     scale = np.where(spread > _TINY, spread, 1.0)
     known = calibration.is_in | calibration.is_out
@@ -73,21 +101,21 @@ def fit(calibration: CalibrationSplit) -> Detector:
     counts = np.array([(y == 0).sum(), (y == 1).sum()])
     effective = np.minimum(MOST_EFFECTIVE, counts / CORRELATED_FRAMES) / np.maximum(counts, 1)
     frame_weight = effective[y.astype(int)]
-    prior = np.array(list(PRIOR.values()))
+    expected = np.array(list(weights.values()))
 
     def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
         weight, bias = parameters[:-1], parameters[-1]
         log_odds = np.sum(z * weight[None], axis=1) + bias
         surprise = frame_weight * (np.logaddexp(0.0, log_odds) - y * log_odds)
         residual = frame_weight * (1.0 / (1.0 + np.exp(-log_odds)) - y)
-        pull = weight - prior
+        pull = weight - expected
         value = surprise.sum() + 0.5 * PRIOR_PRECISION * np.sum(pull**2) + 0.005 * bias**2
         slope = np.sum(residual[:, None] * z, axis=0) + PRIOR_PRECISION * pull
         return float(value), np.append(slope, residual.sum() + 0.01 * bias)
 
-    best = minimize(loss, np.append(prior, 0.0), jac=True, method="L-BFGS-B").x
+    best = minimize(loss, np.append(expected, 0.0), jac=True, method="L-BFGS-B").x
     detector = Detector(
-        columns=tuple(PRIOR),
+        columns=tuple(weights),
         mean=mean,
         scale=scale,
         weight=best[:-1],

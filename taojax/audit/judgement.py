@@ -90,7 +90,8 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
 
     share, gap = audit.calibration_share, config.stream.window
     first = labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
-    model = calibration.fit(first.calibration)
+    recall = float(run.manifest.get("map_recall", calibration.LIST_RECALL))
+    model = calibration.fit(first.calibration, recall)
     verdicts = decide(run.signals, first.calibration, model)
     # Cut again with the probability beside the signals: only the splitter makes the two tables.
     with_fused = signals | {tables.FUSED: verdicts["probability_map_out"]}

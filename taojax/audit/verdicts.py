@@ -15,6 +15,10 @@ ABSTAIN = {
 }
 """Statuses in which nothing is decided."""
 
+STALE = "stale: the newest frame itself does not support the place"
+"""Why a frame that looks in-map is not accepted: its closure would rest on older frames alone, and
+after a kidnap those are wrong."""
+
 
 def plain(value: float) -> str:
     """Return four significant digits without an exponent, for people."""
@@ -63,6 +67,10 @@ def decide(
             reason.append(ABSTAIN.get(status, no_level))
             continue
         is_above = p[t] > threshold
+        if not is_above and signals["stale"][t] > 0:
+            verdict.append("abstain")
+            reason.append(STALE)
+            continue
         verdict.append("reject" if is_above else "accept")
         reason.append(
             f"probability {plain(p[t])} {'exceeds' if is_above else 'is within'} threshold "

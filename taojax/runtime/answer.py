@@ -1,4 +1,4 @@
-"""What the best branch says of a frame, and whether it contradicts what was established."""
+"""What the best branch says of a frame."""
 
 from typing import NamedTuple
 
@@ -14,23 +14,6 @@ from taojax.core.se2 import compose
 from taojax.runtime.joint import JointReading
 from taojax.runtime.maps import MapTables
 
-ESTABLISHED_SHARE = 0.5
-"""A branch is established when at least this share of the full window are its inliers."""
-
-FRESH_FRAMES = 3
-"""So many newest inliers in a row, far from the old alignment, are a kidnap."""
-
-
-class Established(eqx.Module):
-    """Memory of the last alignment that most of a full window agreed on."""
-
-    pose: Float[Array, "3"]
-    """Dead-reckoned from it; meaningless before the first."""
-
-    ever: Bool[Array, ""]
-    is_lost: Bool[Array, ""]
-    """The robot was moved without odometry noticing, and no branch is established since."""
-
 
 class Answer(NamedTuple):
     """What the best branch says of the newest frame, whatever the association."""
@@ -40,12 +23,22 @@ class Answer(NamedTuple):
     share: Float[Array, ""]
     """Share of the filled window frames that are inliers."""
 
-    is_fresh: Bool[Array, ""]
-    """The newest frames are all inliers."""
+    stale: Float[Array, ""]
+    """Frames since the branch was last supported by one."""
+
+    is_lost: Bool[Array, ""]
+    """The newest frames contradict what the window says: the robot was moved without odometry
+    noticing, and no branch is established since."""
 
     is_degenerate: Bool[Array, ""]
     is_known: Bool[Array, ""]
     """There is a hypothesis at all."""
+
+
+def _since(is_inlier: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Return the frames before the first inlier, newest first; their number without any."""
+    n = is_inlier.shape[0]
+    return jnp.where(jnp.any(is_inlier), jnp.argmax(is_inlier), n).astype(jnp.float32)
 
 
 def rank_answer(
@@ -57,7 +50,8 @@ def rank_answer(
         pose=best.T_map_odom,
         map_index=map_index,
         share=jnp.sum(best.is_inlier.astype(best.geom.dtype)) / n_filled,
-        is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
+        stale=_since(best.is_inlier[::-1]),
+        is_lost=jnp.zeros((), bool),  # the literal cost knows no jumps
         is_degenerate=best.is_degenerate,
         is_known=has_candidates,
     )
@@ -65,14 +59,15 @@ def rank_answer(
 
 def joint_answer(tables: MapTables, reading: JointReading) -> Answer:
     """Return the answer of the best joint branch."""
-    best = reading.best
+    best, said = reading.best, reading.report
     n_filled = jnp.sum(reading.is_filled.astype(best.cost.dtype))
-    nearest = look_up(tables.grid, best.T_map_odom[None, :2])[0]
+    nearest = look_up(tables.grid, said.pose[:2])
     return Answer(
-        pose=best.T_map_odom,
-        map_index=jnp.where(best.is_inlier[-1], best.anchor[-1], nearest),
+        pose=said.pose,
+        map_index=jnp.where(said.anchor >= 0, said.anchor, nearest),
         share=jnp.sum(best.is_inlier.astype(best.cost.dtype)) / n_filled,
-        is_fresh=jnp.all(best.is_inlier[-FRESH_FRAMES:]),
+        stale=said.stale,
+        is_lost=said.is_jump,
         # The heading prior determines the angle; without any inlier the seed itself is the pose.
         is_degenerate=jnp.zeros((), bool),
         # The carried branch bridges a frame without candidates.
@@ -99,38 +94,3 @@ def joint_terms(
         "tao_window": best.cost,
         "tao_rival": reading.rival,
     }
-
-
-def init_established() -> Established:
-    """Return the memory before anything was established."""
-    return Established(jnp.zeros(3), jnp.zeros((), bool), jnp.zeros((), bool))
-
-
-def watch(
-    seen: Established,
-    odometry: Float[Array, "3"],
-    answer: Answer,
-    has_pose: Bool[Array, ""],
-    is_full: Bool[Array, ""],
-    mask_m: float | Float[Array, ""],
-) -> Established:
-    """Follow the last established alignment and notice when fresh evidence contradicts it.
-
-    Args:
-        seen: memory.
-        odometry: motion into this frame.
-        answer: of the best branch.
-        has_pose: the answer may be used.
-        is_full: the window is full; a half-empty one establishes nothing.
-        mask_m: farther than this from the dead-reckoned pose is another place.
-    """
-    predicted = compose(seen.pose, odometry)
-    is_established = has_pose & is_full & (answer.share >= ESTABLISHED_SHARE)
-    gap = answer.pose[:2] - predicted[:2]
-    is_far = jnp.hypot(gap[0], gap[1]) > mask_m
-    is_noticed = seen.ever & has_pose & answer.is_fresh & is_far
-    return Established(
-        pose=jnp.where(is_established, answer.pose, predicted),
-        ever=seen.ever | is_established,
-        is_lost=~is_established & (seen.is_lost | is_noticed),
-    )

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from taojax.config import StreamConfig
 from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch, pool
 from taojax.core.se2 import compose, inverse, transform
+from taojax.runtime.choice import Report, report
 from taojax.runtime.maps import MapTables
 
 GAMMA = 1.0
@@ -37,9 +38,9 @@ class JointState(eqx.Module):
     slot: Int[Array, ""]
     """Where the next frame goes."""
 
-    carried: Float[Array, "3"]
-    """Pose of the last best branch: one more seed, so that a frame whose candidates all miss the
-    place does not break the branch."""
+    carried: Float[Array, "2 3"]
+    """Poses of the last best branch and of its challenger: two more seeds, so that a frame whose
+    candidates all miss the place does not break a branch."""
 
     has_carried: Bool[Array, ""]
 
@@ -49,6 +50,9 @@ class JointReading(eqx.Module):
 
     best: JointBranch
     """The cheapest branch; frames in time order, newest last."""
+
+    report: Report
+    """The place to report, usually the best branch's."""
 
     rival: Float[Array, ""]
     """Cost of the cheapest branch somewhere else."""
@@ -73,7 +77,7 @@ def init_joint(config: StreamConfig, n_anchors: int) -> JointState:
         pooled=jnp.full((n, n_anchors), c, np.min_scalar_type(c)),
         is_filled=jnp.zeros(n, bool),
         slot=jnp.zeros((), jnp.int32),
-        carried=jnp.zeros(3),
+        carried=jnp.zeros((2, 3)),
         has_carried=jnp.zeros((), bool),
     )
 
@@ -89,14 +93,14 @@ def joint_params(config: StreamConfig, tables: MapTables) -> JointParams:
 
 
 def _seeds(
-    config: StreamConfig, tables: MapTables, index: Int[Array, " c"], carried: Float[Array, "3"]
+    config: StreamConfig, tables: MapTables, index: Int[Array, " c"], carried: Float[Array, "2 3"]
 ) -> Float[Array, "s 3"]:
-    """Return the newest candidates' map poses in both travel directions, and the carried pose."""
+    """Return the newest candidates' map poses in both travel directions, and the carried poses."""
     row = jnp.maximum(index[: config.joint_seeds], 0)
     theta = tables.grid.theta[row]
     ahead = jnp.concatenate([tables.grid.xy[row], theta[:, None]], axis=1)
     back = jnp.concatenate([tables.grid.xy[row], theta[:, None] + jnp.pi], axis=1)
-    return jnp.concatenate([ahead, back, carried[None]])
+    return jnp.concatenate([ahead, back, carried])
 
 
 def joint_step(
@@ -131,21 +135,23 @@ def joint_step(
     decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
     window = JointWindow(p, decay / jnp.sum(decay), listed, similarity, pooled)
 
-    carried = compose(state.carried, odometry)
+    carried = compose(state.carried, jnp.broadcast_to(odometry, (2, 3)))
     seeds = _seeds(config, tables, index, carried)
     n_lists = min(config.joint_seeds, index.shape[0])
     is_seed = index[:n_lists] >= 0
     # Without any candidate and history the first anchor is as good a guess as any.
-    is_live = jnp.concatenate([is_seed, is_seed, state.has_carried[None]])
+    is_live = jnp.concatenate([is_seed, is_seed, jnp.repeat(state.has_carried, 2)])
     branches = jax.vmap(joint_branch, in_axes=(None, None, None, 0))(
         params, tables.grid, window, seeds
     )
-    cost = jnp.where(is_live | ~jnp.any(is_live), branches.cost, jnp.inf)
+    is_live = is_live | ~jnp.any(is_live)
+    cost = jnp.where(is_live, branches.cost, jnp.inf)
     winner = jnp.argmin(cost)
     best: JointBranch = jax.tree.map(lambda leaf: leaf[winner], branches)
     gap = branches.T_map_odom[:, :2] - best.T_map_odom[None, :2]
     is_elsewhere = jnp.sum(gap**2, axis=1) > (DISTINCT_DELTAS * params.delta_m) ** 2
     rival = jnp.minimum(GAMMA, jnp.min(jnp.where(is_elsewhere, cost, GAMMA)))
+    said = report(params, tables.grid.xy, window, branches, winner, is_live, age, tables.recall)
 
     # The ring read from its oldest slot to its newest.
     order = jnp.mod(slot + 1 + jnp.arange(n), n)
@@ -162,7 +168,7 @@ def joint_step(
         pooled=pooled,
         is_filled=is_filled,
         slot=jnp.mod(slot + 1, n),
-        carried=best.T_map_odom,
+        carried=jnp.stack([best.T_map_odom, said.challenger]),
         has_carried=has_carried,
     )
-    return state, JointReading(in_time, rival, has_carried, is_filled[order], p[order])
+    return state, JointReading(in_time, said, rival, has_carried, is_filled[order], p[order])

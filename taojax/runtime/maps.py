@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from taojax.config import StreamConfig
 from taojax.core.association import AnchorGrid
-from taojax.runtime.scale import LIST_SCALE, map_scale
+from taojax.runtime.scale import LIST_RECALL, LIST_SCALE, MapView, view_map
 
 NEIGHBOURS = 12
 """Anchors pooled around each anchor."""
@@ -35,6 +35,9 @@ class MapTables(eqx.Module):
 
     scale: Float[Array, "2"]
     """Background and strong similarity."""
+
+    recall: Float[Array, ""]
+    """How far the map tells its own places apart, 0 to 1."""
 
 
 def map_spacing_m(xy: np.ndarray) -> float:
@@ -90,18 +93,20 @@ def map_tables(
     Args:
         poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
         config: sets the Huber threshold in map spacings; defaults when omitted.
-        descriptors: `(M, D)` of the map images; they fix the similarity scale, which is 0 to 1
-            when omitted.
+        descriptors: `(M, D)` of the map images; they fix the similarity scale and the recall,
+            which are 0 to 1 and 0.75 when omitted.
     """
     config = StreamConfig() if config is None else config
     poses = np.asarray(poses, float)
     spacing_m = map_spacing_m(poses[:, :2])
+    view = MapView(np.array(LIST_SCALE), LIST_RECALL)
+    if descriptors is not None:
+        view = view_map(descriptors, poses[:, :2], spacing_m)
     centred = poses[:, :2] - poses[:, :2].mean(axis=0)
     return MapTables(
         grid=_grid(poses, spacing_m, float(config.delta_spacings) * spacing_m),
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
         extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
-        scale=jnp.asarray(
-            LIST_SCALE if descriptors is None else map_scale(descriptors), jnp.float32
-        ),
+        scale=jnp.asarray(view.scale, jnp.float32),
+        recall=jnp.asarray(view.recall, jnp.float32),
     )

@@ -48,6 +48,9 @@ class Observations:
     sha256: dict[str, str]
     """Hash of every file that was read."""
 
+    trial_frames: int | None = None
+    """The log is a row of trials of so many frames, each with a fresh start; None = one log."""
+
 
 def _check_rows(path: Path, n_rows: int, n_wanted: int, other: Path) -> None:
     if n_rows != n_wanted:
@@ -121,16 +124,25 @@ def _load_retrievals(path: Path, n_map: int, n_query: int, odometry: Path) -> Re
     return Retrievals(index.astype(np.int32), np.minimum(similarity, 1.0))
 
 
-def _load_notes(path: Path) -> tuple[str, ...]:
+def _load_about(path: Path, n_query: int) -> tuple[tuple[str, ...], int | None]:
+    """Return the notes and the length of a trial."""
     if not path.exists():
-        return ()
+        return (), None
     try:
-        notes = tomllib.loads(read_text(path)).get("notes", [])
+        about = tomllib.loads(read_text(path))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not TOML ({error}); expected notes = [...]") from error
+    notes, frames = about.get("notes", []), about.get("trial_frames")
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         raise InputError(f"{path}: notes is not a list of sentences; expected notes = [...]")
-    return tuple(notes)
+    if frames is None:
+        return tuple(notes), None
+    if type(frames) is not int or frames < 1 or n_query % frames:
+        raise InputError(
+            f"{path}: trial_frames is {frames!r}; expected a whole number of frames, at least 1,"
+            f" that divides the {n_query} rows of query/odometry.csv"
+        )
+    return tuple(notes), frames
 
 
 def load_observations(folder: Path) -> Observations:
@@ -156,7 +168,7 @@ def load_observations(folder: Path) -> Observations:
     else:
         descriptors = _load_descriptors(folder, n_map, n_query)
         files += ["map/descriptors.npy", "query/descriptors.npy"]
-    notes = _load_notes(folder / "about.toml")
+    notes, trial_frames = _load_about(folder / "about.toml", n_query)
     files += ["about.toml"] if (folder / "about.toml").exists() else []
     motion = np.stack([odometry[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
     return Observations(
@@ -167,4 +179,5 @@ def load_observations(folder: Path) -> Observations:
         retrievals=retrievals,
         notes=notes,
         sha256={f"inputs/{name}": digest_file(folder / name) for name in files},
+        trial_frames=trial_frames,
     )

@@ -5,6 +5,8 @@ scale follows the robot off the map. So the scale comes from the map's own image
 descriptors are known, and a list's similarities, which its author scaled, are taken as they are.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -27,19 +29,35 @@ LEAST_RANGE = 0.02
 BACKGROUND_RANK = 100
 """The background is the similarity of the 100th best image, the paper's K."""
 
+NEAR_SPACINGS = 9.0
+"""An image within so many map spacings shows the same place."""
+
+LIST_RECALL = 0.75
+"""Recall of retrieval lists without map descriptors: neither blind nor sure."""
+
 SAMPLE = 512
 """Map images that vote on the scale, evenly spaced."""
 
 
-def map_scale(descriptors: np.ndarray) -> np.ndarray:
-    """Return background and strong similarity as the map alone shows them.
+class MapView(NamedTuple):
+    """What a map's own images say of the frontend."""
+
+    scale: np.ndarray
+    """(2,) background: mean similarity of the 100th best other map image (of the median one in
+    small maps); strong: 75 % quantile of the best other map image."""
+
+    recall: float
+    """Share of images whose most similar other image lies nearby: how far this map tells its own
+    places apart."""
+
+
+def view_map(descriptors: np.ndarray, xy: np.ndarray, spacing_m: float) -> MapView:
+    """Return scale and recall as the map alone shows them.
 
     Args:
         descriptors: `(M, D)` of the map images, any scale.
-
-    Returns:
-        `(2,)` background: mean similarity of the 100th best other map image (of the median one in
-        small maps); strong: 75 % quantile of the best other map image.
+        xy: `(M, 2)` their positions [m].
+        spacing_m: median distance between neighbouring images.
     """
     chosen = np.unique(np.linspace(0, len(descriptors) - 1, SAMPLE).astype(int))
     sample = jnp.asarray(normalise(descriptors[chosen]))
@@ -50,11 +68,13 @@ def map_scale(descriptors: np.ndarray) -> np.ndarray:
     rows = np.concatenate(parts, axis=1)
     mean = rows.mean()
     rows[np.arange(len(chosen)), chosen] = -np.inf
+    gap = np.asarray(xy)[chosen] - np.asarray(xy)[np.argmax(rows, axis=1)]
+    is_near = np.hypot(gap[:, 0], gap[:, 1]) <= NEAR_SPACINGS * spacing_m
     ranked = -np.sort(-rows, axis=1)
     rank = max(1, min(BACKGROUND_RANK, len(descriptors) // 2)) - 1
     background = mean + BACKGROUND_SHARE * (ranked[:, rank].mean() - mean)
     strong = mean + STRONG_SHARE * (np.quantile(ranked[:, 0], STRONG_QUANTILE) - mean)
-    return np.array([background, strong])
+    return MapView(np.array([background, strong]), float(is_near.mean()))
 
 
 def rescale(scale: Float[Array, "2"], similarity: Float[Array, " c"]) -> Float[Array, " c"]:

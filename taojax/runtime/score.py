@@ -11,13 +11,14 @@ import numpy as np
 from tqdm import tqdm
 
 from taojax import __version__
-from taojax.config import Config, to_toml
+from taojax.config import Config, replace, to_toml
 from taojax.detector import Detector, probability
 from taojax.errors import InputError
 from taojax.records import digest, refuse_if_taken, write_run
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
+from taojax.runtime.rivals import rival_tracks, sealed_track
 from taojax.runtime.stream import (
     STATUSES,
     Frame,
@@ -25,6 +26,7 @@ from taojax.runtime.stream import (
     init,
     replay,
 )
+from taojax.runtime.trials import in_trials, replay_trials
 
 CHUNK_FRAMES = 256
 """Frames per scan; one compilation, and a progress bar that moves."""
@@ -120,6 +122,7 @@ def decide(detector: Detector, table: dict[str, np.ndarray]) -> dict[str, np.nda
     """
     p = probability(detector, table)
     verdict = np.where(p > detector.threshold, "reject", "accept").astype(object)
+    verdict[(verdict == "accept") & (table["stale"] > 0)] = "abstain"
     verdict[table["status"] != "ok"] = "abstain"
     return {"frame": table["frame"], "verdict": verdict, "probability_map_out": p}
 
@@ -130,15 +133,22 @@ def score(
     config: Config,
     *,
     detector: Detector | None = None,
+    rivals: bool = False,
+    rival_logs: int | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
     """Score a data folder and seal the result; needs no truth and never looks for it.
+
+    A folder of trials (`trial_frames` in about.toml) is replayed trial by trial, each from a fresh
+    start.
 
     Args:
         dataset: a data folder, laid out as data_specs/README.md says.
         out: run folder to make; must be absent or empty.
         config: settings.
         detector: frozen numbers of an earlier audit; adds decisions.csv.
+        rivals: also run the rank association and every rival; adds tracks.npz.
+        rival_logs: rivals, but not the rank association, only on so many first trials.
         progress: draw a bar on stderr.
 
     Returns:
@@ -154,7 +164,19 @@ def score(
     known = observations.descriptors and observations.descriptors[0]
     tables = map_tables(np.stack(xyt, axis=1), config.stream, known)
     frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))
-    records = replay_log(config, tables, frames, progress=progress)
+    n = observations.trial_frames
+
+    def replayed(config: Config) -> StreamRecord:
+        if n is None:
+            return replay_log(config, tables, frames, progress=progress)
+        return replay_trials(config, tables, in_trials(frames, n), progress=progress)
+
+    records = replayed(config)
+    tracks = None
+    if rivals:
+        literal = replayed(replace(config, {"association": "rank"}))
+        said = rival_tracks(observations, frames, most_logs=rival_logs, progress=progress)
+        tracks = {"tao_rank": sealed_track(literal, "tao_rank"), **said}
     # What repeats this run, seen from its own folder; the words typed may name files long gone.
     command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records)
@@ -162,6 +184,7 @@ def score(
         out,
         signals=table,
         decisions=None if detector is None else decide(detector, table),
+        tracks=tracks,
         map_poses=observations.map_poses,
         index=index,
         similarity=similarity,
@@ -169,6 +192,7 @@ def score(
         manifest={
             **_facts(command, dataset, config.seed),
             "notes": list(observations.notes),
+            "map_recall": float(tables.recall),
             "sha256": observations.sha256,
         },
     )

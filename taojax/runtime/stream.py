@@ -22,15 +22,7 @@ from taojax.core.cost import (
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
 from taojax.runtime import signals
-from taojax.runtime.answer import (
-    FRESH_FRAMES,
-    Established,
-    init_established,
-    joint_answer,
-    joint_terms,
-    rank_answer,
-    watch,
-)
+from taojax.runtime.answer import joint_answer, joint_terms, rank_answer
 from taojax.runtime.joint import JointState, init_joint, joint_step
 from taojax.runtime.maps import MapTables
 from taojax.runtime.recursive import RecursiveState, init_recursive, recursive_step
@@ -38,6 +30,9 @@ from taojax.runtime.scale import rescale
 
 STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
 WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
+
+WARM_FRAMES = 3
+"""Frames seen before anything is said of a place."""
 
 
 class Frame(eqx.Module):
@@ -84,7 +79,6 @@ class StreamState(eqx.Module):
     n_seen: Int[Array, ""]
     """Frames so far; stops counting at the longest window, so that it never wraps."""
 
-    established: Established
     memory: Memory | None
     """Of the joint branches; None where `tao` is the rank cost."""
 
@@ -130,7 +124,6 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
         is_filled=jnp.zeros(n, bool),
         top1=jnp.zeros(max(signals.WINDOWS)),
         n_seen=jnp.zeros((), jnp.int32),
-        established=init_established(),
         memory=None if config.association == "rank" else _init_memory(config, tables),
     )
 
@@ -244,13 +237,13 @@ def step(
         **terms,
         **rank_terms,
         "support": 1.0 - answer.share,
+        "stale": answer.stale,
     }
 
-    is_warm = n_seen >= FRESH_FRAMES
+    is_warm = n_seen >= WARM_FRAMES
     has_pose = answer.is_known & is_warm
-    established = watch(state.established, odometry, answer, has_pose, is_filled[0], params.mask_m)
     status = jnp.select(
-        [~is_warm, ~has_candidates, answer.is_degenerate, established.is_lost],
+        [~is_warm, ~has_candidates, answer.is_degenerate, answer.is_lost],
         [WARMING_UP, NO_CANDIDATES, DEGENERATE, LOST],
         OK,
     )
@@ -269,7 +262,6 @@ def step(
         is_filled=is_filled,
         top1=history,
         n_seen=n_seen,
-        established=established,
         memory=memory,
     )
     return state, record

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -94,7 +95,9 @@ def out_of(args: Common, verb: str, config: "Config") -> Path:
     )
 
 
-def score_apart(dataset: Path, out: Path, config: "Config", *, progress: bool) -> None:
+def score_apart(
+    dataset: Path, out: Path, config: "Config", *, progress: bool, flags: Sequence[str] = ()
+) -> None:
     """Score in a fresh interpreter: one in which the judge has never been imported."""
     from taojax.config import to_toml
 
@@ -102,7 +105,7 @@ def score_apart(dataset: Path, out: Path, config: "Config", *, progress: bool) -
         path = Path(scratch) / "config.toml"
         path.write_text(to_toml(config), encoding="utf-8")
         flag = "--progress" if progress else "--no-progress"
-        words = ["score", str(dataset), "--out", str(out), "--config", str(path), flag]
+        words = ["score", str(dataset), "--out", str(out), "--config", str(path), flag, *flags]
         done = subprocess.run([sys.executable, "-m", "taojax", *words], check=False)
     if done.returncode:
         raise SystemExit(done.returncode)

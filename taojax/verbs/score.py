@@ -22,6 +22,12 @@ class Score(Common):
     calibration: Annotated[Path | None, flag("FILE.toml", "no verdicts at run time")] = None
     """calibration.toml of an audited run: adds decisions.csv, verdicts at frozen numbers."""
 
+    rivals: bool = False
+    """Also run the rank association and every rival: adds tracks.npz. Slow."""
+
+    rival_logs: Annotated[int | None, flag("N", "all")] = None
+    """Of a folder of trials, run the rivals on the first so many alone."""
+
 
 def run(args: Score) -> None:
     """Score a data folder and seal the result."""
@@ -31,5 +37,13 @@ def run(args: Score) -> None:
     config = config_of(args)
     out = out_of(args, "score", config)
     detector = None if args.calibration is None else from_toml(args.calibration)
-    manifest = score(args.dataset, out, config, detector=detector, progress=args.progress)
+    manifest = score(
+        args.dataset,
+        out,
+        config,
+        detector=detector,
+        rivals=args.rivals,
+        rival_logs=args.rival_logs,
+        progress=args.progress,
+    )
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")

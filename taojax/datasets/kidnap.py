@@ -1,0 +1,266 @@
+"""Splices kidnap logs: the robot is carried elsewhere, and its odometry does not notice.
+
+A log is a row of stretches, each a run of consecutive frames that really followed one another in
+the source. Into the first frame of a stretch leads the motion that belonged to that frame: the
+robot believes that it drove on. Views are those of the source; odometry is the true motion plus
+simulated drift.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from taojax.errors import InputError
+
+__all__ = [
+    "LEVELS", "Drift", "Log", "Plan", "Source", "in_map", "make_logs", "motions", "noisy_odometry",
+    "splice",
+]  # fmt: skip
+
+TRIAL_FRAMES = 160
+"""Frames of a log."""
+
+WINDOW_FRAMES = 20
+"""Frames over which the end drift of a level is stated; a jump nearer to the end is no trial."""
+
+FAR_M = 100.0
+"""A kidnap carries the robot at least so far, metres, or ..."""
+
+FAR_SHARE = 0.25
+"""... this share of the map's longer side, if that is less."""
+
+CALIBRATION_EVERY = 5
+"""Every so many logs one is set apart for thresholds; its kidnaps are not counted."""
+
+
+class Drift(NamedTuple):
+    """End drift over a window: root mean square, half of its variance white and half bias."""
+
+    share: float
+    """Of the translation alone, as a share of the distance driven; yaw bends the path on top."""
+
+    yaw_deg: float
+    """Of the heading, degrees per window."""
+
+
+LEVELS: Mapping[str, Drift] = {
+    "low": Drift(0.01, 0.5),
+    "medium": Drift(0.07, 7.5),
+    "high": Drift(0.18, 31.0),
+}
+"""Placed about what real recordings show over 20 frames: mit_corridor 1.0 % and 0.5 degrees,
+tuc_corridor 6.9 % and 7.5 degrees, intel_lab 18.4 % and 31 degrees."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What logs are spliced from; pose rows are (t [s], x [m], y [m], theta [rad])."""
+
+    map_poses: Float[np.ndarray, "m 4"]
+    query_poses: Float[np.ndarray, "t 4"]
+    """True poses."""
+
+    seen_m: Float[np.ndarray, "t 2"] | None
+    """Where in the map a frame's appearance belongs; None where nobody knows."""
+
+    map_views: np.ndarray | None
+    """(M, D) descriptors of the map; None with retrieval lists."""
+
+    query_views: tuple[np.ndarray, ...]
+    """Descriptors (T, D), or lists: index (T, K) and similarity (T, K)."""
+
+    notes: tuple[str, ...]
+
+
+class Plan(NamedTuple):
+    """How logs are cut."""
+
+    n_trials: int
+    """Counted kidnaps wanted per drift level."""
+
+    stretch: tuple[int, int] = (30, 50)
+    """Shortest and longest stretch, frames."""
+
+    r_in_m: float = 10.0
+    """A stretch stays within this distance of some map pose."""
+
+
+class Log(NamedTuple):
+    """One spliced log of `TRIAL_FRAMES` frames."""
+
+    rows: Int[np.ndarray, " n"]
+    """Frames of the source."""
+
+    odometry: Float[np.ndarray, "n 3"]
+    """Forward [m], left [m], yaw [rad]; row 0 is zero."""
+
+    kidnaps: Int[np.ndarray, " k"]
+    """First frames after a jump, all of them."""
+
+    step_m: Float[np.ndarray, " k"]
+    """Metres truly driven into each of these frames, after the robot was put down."""
+
+    drift: str
+    stretch: int
+    """Middle of the range of stretch lengths, frames."""
+
+    split: str
+    """calibration or test."""
+
+
+def motions(poses: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 3"]:
+    """Return the true motion into each frame, in body axes of the frame before; row 0 is zero.
+
+    Args:
+        poses: rows (t [s], x [m], y [m], theta [rad]).
+
+    Returns:
+        Forward [m], left [m], yaw [rad] in (-pi, pi].
+    """
+    step, theta = np.diff(poses[:, 1:3], axis=0), poses[:-1, 3]
+    out = np.zeros((len(poses), 3))
+    out[1:, 0] = np.cos(theta) * step[:, 0] + np.sin(theta) * step[:, 1]
+    out[1:, 1] = np.cos(theta) * step[:, 1] - np.sin(theta) * step[:, 0]
+    out[1:, 2] = np.angle(np.exp(1j * np.diff(poses[:, 3])))
+    return out
+
+
+def in_map(source: Source, r_in_m: float) -> Bool[np.ndarray, " t"]:
+    """Tell which query frames truly lie within `r_in_m` of some map pose."""
+    map_m = source.map_poses[:, 1:3]
+    gap = [
+        np.min(np.sum((map_m - place[None]) ** 2, axis=1)) for place in source.query_poses[:, 1:3]
+    ]
+    return np.array(gap) <= r_in_m**2
+
+
+def far_m(source: Source) -> float:
+    """Return how far a kidnap carries the robot at least, metres."""
+    return min(FAR_M, FAR_SHARE * float(np.ptp(source.map_poses[:, 1:3], axis=0).max()))
+
+
+def window_m(source: Source) -> float:
+    """Return the usual distance driven in a window, metres: the unit of the drift levels."""
+    step = np.hypot(*np.diff(source.query_poses[:, 1:3], axis=0).T)
+    moving = step[step > 1e-6]
+    return WINDOW_FRAMES * (float(np.median(moving)) if moving.size else 1.0)
+
+
+def noisy_odometry(
+    motion: Float[np.ndarray, "n 3"], drift: Drift, distance_m: float, rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """Add drift to true motion: white noise per step, a constant scale and a constant yaw bias.
+
+    The white part of a step has a standard deviation in proportion to the root of its length. The
+    signs of the two constants are drawn once per call.
+
+    Args:
+        motion: forward [m], left [m], yaw [rad] per step; row 0 is not used.
+        drift: root mean square end drift over `distance_m`.
+        distance_m: metres driven in a window.
+        rng: of the noise.
+
+    Returns:
+        The odometry; row 0 is zero.
+    """
+    length = np.hypot(motion[:, 0], motion[:, 1])
+    half, yaw = np.sqrt(0.5), np.radians(drift.yaw_deg)
+    scale, turn = rng.choice((-1.0, 1.0), 2) * half * np.array([drift.share, yaw / distance_m])
+    # Two axes share the variance of the translation.
+    white_m = half * drift.share * distance_m / np.sqrt(2.0 * distance_m)
+    white_rad = half * yaw / np.sqrt(distance_m)
+    noise = rng.standard_normal(motion.shape) * np.sqrt(length)[:, None]
+    noise *= np.array([[white_m, white_m, white_rad]])
+    noise[:, :2] += scale * motion[:, :2]
+    noise[:, 2] += turn * length
+    out = motion + noise
+    out[0] = 0.0
+    return out
+
+
+def _room(inside: Bool[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
+    """Return how many consecutive in-map frames begin at each frame; frame 0 has no motion."""
+    room = np.zeros(len(inside) + 1, int)
+    for i in range(len(inside) - 1, 0, -1):
+        room[i] = room[i + 1] + 1 if inside[i] else 0
+    return room[:-1]
+
+
+def splice(
+    source: Source, plan: Plan, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " k"]]:
+    """Draw stretches until a log is full.
+
+    Args:
+        source: where from.
+        plan: lengths and radius.
+        rng: draws lengths and places.
+
+    Returns:
+        Rows of the source and the first frames after the jumps.
+
+    Raises:
+        InputError: no stretch is long enough and far enough away.
+    """
+    place, least_m = source.query_poses[:, 1:3], far_m(source)
+    room = _room(in_map(source, plan.r_in_m))
+    rows, jumps = np.zeros(0, int), []
+    low, high = plan.stretch
+    while len(rows) < TRIAL_FRAMES:
+        is_far = np.ones(len(place), bool)
+        if len(rows):
+            is_far = np.hypot(*(place - place[rows[-1]][None]).T) >= least_m
+        longest = int(min(high, room[is_far].max(initial=0)))
+        if longest < low:
+            raise InputError(
+                f"no stretch of {low} in-map frames lies {least_m:.0f} m or more from the one"
+                f" before (in-map: truth within {plan.r_in_m:g} m of a map pose); give a longer"
+                " recording that visits more of its map, or a larger --r-in"
+            )
+        length = int(rng.integers(low, longest + 1))
+        start = int(rng.choice(np.flatnonzero(is_far & (room >= length))))
+        if len(rows):
+            jumps.append(len(rows))
+        rows = np.concatenate([rows, np.arange(start, start + length)])
+    return rows[:TRIAL_FRAMES], np.array(jumps, int)
+
+
+def make_logs(
+    source: Source, plan: Plan, seed: int, levels: Sequence[str] = tuple(LEVELS)
+) -> list[Log]:
+    """Splice logs until enough kidnaps are counted; every level gets the same kidnaps.
+
+    Logs of the levels take turns, so that any first part of the list holds as much of each.
+
+    Args:
+        source: where from.
+        plan: how many and how.
+        seed: the same source, plan and seed give the same logs.
+        levels: keys of `LEVELS`.
+
+    Returns:
+        The logs. Of every five per level the first is for calibration; jumps in the last
+        `WINDOW_FRAMES` frames are in `kidnaps` but do not count.
+
+    Raises:
+        InputError: the source has too few in-map stretches.
+    """
+    rng = np.random.default_rng([seed, 1])
+    true_motion, unit_m = motions(source.query_poses), window_m(source)
+    length = np.hypot(true_motion[:, 0], true_motion[:, 1])
+    logs: list[Log] = []
+    n_counted, number = 0, 0
+    while n_counted < plan.n_trials:
+        rows, jumps = splice(source, plan, rng)
+        split = "test" if number % CALIBRATION_EVERY else "calibration"
+        for level in levels:
+            odometry = noisy_odometry(true_motion[rows], LEVELS[level], unit_m, rng)
+            middle = sum(plan.stretch) // 2
+            logs.append(Log(rows, odometry, jumps, length[rows[jumps]], level, middle, split))
+        if split == "test":
+            n_counted += int((jumps <= TRIAL_FRAMES - WINDOW_FRAMES).sum())
+        number += 1
+    return logs

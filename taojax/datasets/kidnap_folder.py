@@ -1,0 +1,162 @@
+"""Kidnap logs on disk: sources read from a world or a data folder, logs written as a data folder."""
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from taojax.datasets.kidnap import LEVELS, TRIAL_FRAMES, WINDOW_FRAMES, Log, Source
+from taojax.datasets.simulate import make_world
+from taojax.datasets.world import NOTE, WorldConfig
+from taojax.errors import InputError
+from taojax.specs import (
+    read_npy,
+    read_npz,
+    read_table,
+    read_text,
+    table_text,
+    write_atomically,
+)
+
+__all__ = ["folder_source", "world_source", "write_logs"]
+
+_POSE = ("t_s", "x_m", "y_m", "theta_rad")
+_ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
+
+
+def world_source(config: WorldConfig, seed: int) -> Source:
+    """Simulate a world to splice from, with the place whose appearance each frame saw."""
+    world = make_world(config, seed)
+    # Each knob has its own random stream: without the offset the same places are driven.
+    aligned = make_world(dataclasses.replace(config, offset_cap_m=0.0), seed)
+    return Source(
+        map_poses=world.map_poses,
+        query_poses=world.query_poses,
+        seen_m=aligned.query_poses[:, 1:3],
+        map_views=world.map_descriptors,
+        query_views=(world.query_descriptors,),
+        notes=(NOTE,),
+    )
+
+
+def _poses(path: Path, spec: str) -> np.ndarray:
+    table = read_table(path, spec)
+    return np.stack([table[name] for name in _POSE], axis=1)
+
+
+def _notes(path: Path) -> tuple[str, ...]:
+    try:
+        notes = tomllib.loads(read_text(path)).get("notes", []) if path.exists() else []
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is not TOML ({error}); expected notes = [...]") from error
+    return tuple(str(note) for note in ([notes] if isinstance(notes, str) else notes))
+
+
+def folder_source(folder: Path) -> Source:
+    """Read a data folder with truth to splice from.
+
+    Args:
+        folder: laid out as data_specs/README.md says; its odometry is not used.
+
+    Raises:
+        InputError: a file is missing or malformed, or views and poses differ in number.
+    """
+    map_poses = _poses(folder / "map/poses.csv", "map_poses")
+    query_poses = _poses(folder / "truth/query_poses.csv", "query_poses")
+    lists = folder / "query/retrievals.npz"
+    map_views = None
+    if lists.exists():
+        arrays = read_npz(lists, "retrievals")
+        path, views = lists, (arrays["index"], arrays["similarity"])
+    else:
+        path = folder / "query/descriptors.npy"
+        views = (read_npy(path, "descriptors"),)
+        map_views = read_npy(folder / "map/descriptors.npy", "descriptors")
+    if len(views[0]) != len(query_poses):
+        raise InputError(
+            f"{path}: {len(views[0])} rows, but {folder / 'truth/query_poses.csv'} has"
+            f" {len(query_poses)}; both must describe the same frames"
+        )
+    return Source(map_poses, query_poses, None, map_views, views, _notes(folder / "about.toml"))
+
+
+def _said(source: Source, logs: Sequence[Log]) -> list[str]:
+    """Return what the report must repeat."""
+    n = sum(len(log.kidnaps) for log in logs)
+    levels = dict.fromkeys(log.drift for log in logs)
+    drift = ", ".join(
+        f"{name} {100 * LEVELS[name].share:g} % and {LEVELS[name].yaw_deg:g} degrees"
+        for name in levels
+    )
+    return [
+        *source.notes,
+        f"spliced: {len(logs)} logs of {TRIAL_FRAMES} frames with {n} simulated kidnaps; views are"
+        " those of the source",
+        f"simulated odometry: true motion plus drift; end drift over {WINDOW_FRAMES} frames {drift}",
+    ]
+
+
+def _stacked(stamps: np.ndarray, columns: np.ndarray, names: Sequence[str]) -> dict:
+    return dict(zip(names, (stamps, *columns.T), strict=True))
+
+
+def write_logs(source: Source, logs: Sequence[Log], folder: Path) -> None:
+    """Write logs one after another as a data folder with its truth.
+
+    Args:
+        source: that the logs were spliced from.
+        logs: from `make_logs`.
+        folder: where to; made where absent.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    rows = np.concatenate([log.rows for log in logs])
+    dt_s = float(np.median(np.diff(source.query_poses[:, 0])))
+    stamps = np.arange(len(rows)) * (dt_s if dt_s > 0 else 1.0)
+    odometry = np.concatenate([log.odometry for log in logs])
+    columns = dict(zip(_POSE, source.map_poses.T, strict=True))
+    truth = source.query_poses[rows]
+    files = {
+        "map/poses.csv": table_text("map_poses", columns),
+        "query/odometry.csv": table_text("query_odometry", _stacked(stamps, odometry, _ODOMETRY)),
+        "truth/query_poses.csv": table_text("query_poses", _stacked(stamps, truth[:, 1:], _POSE)),
+        "truth/kidnaps.csv": table_text("kidnaps", _kidnaps(logs)),
+        "truth/logs.csv": table_text("logs", _log_table(logs)),
+        "about.toml": f"trial_frames = {TRIAL_FRAMES}\n"
+        + f"notes = {json.dumps(_said(source, logs), ensure_ascii=False)}\n",
+    }
+    if source.seen_m is not None:
+        seen = np.concatenate([source.seen_m[rows], truth[:, 3:]], axis=1)
+        files["truth/seen_poses.csv"] = table_text("query_poses", _stacked(stamps, seen, _POSE))
+    for name, text in files.items():
+        write_atomically(folder / name, text)
+    if source.map_views is None:
+        index, similarity = (part[rows] for part in source.query_views)
+        np.savez_compressed(folder / "query/retrievals.npz", index=index, similarity=similarity)
+    else:
+        # Half precision halves the folder and moves a cosine by less than a thousandth.
+        np.save(folder / "map/descriptors.npy", np.asarray(source.map_views))
+        views = np.asarray(source.query_views[0])
+        np.save(folder / "query/descriptors.npy", views[rows].astype(np.float16))
+
+
+def _kidnaps(logs: Sequence[Log]) -> dict[str, np.ndarray]:
+    counts = [len(log.kidnaps) for log in logs]
+    return {
+        "log": np.repeat(np.arange(len(logs)), counts),
+        "frame": np.concatenate([log.kidnaps for log in logs]),
+        "step_m": np.concatenate([log.step_m for log in logs]),
+    }
+
+
+def _log_table(logs: Sequence[Log]) -> dict[str, np.ndarray]:
+    return {
+        "log": np.arange(len(logs)),
+        "drift": np.array([log.drift for log in logs], dtype=object),
+        "stretch_frames": np.array([log.stretch for log in logs]),
+        "split": np.array([log.split for log in logs], dtype=object),
+    }

@@ -1,0 +1,297 @@
+"""Many configurations of one recording: the same frames, one compilation, a bounded memory.
+
+What the settings share is prepared once. Rank branches do not depend on the past, so a frame's
+windows are slices of one log, a shorter window or fewer branches are masks, and the weight of the
+similarity term and the number of branches need no second fit: a *unit* of work is one fit with all
+its values of those two. A joint unit is one configuration, a scan over time.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from taojax.config import StreamConfig
+from taojax.core.cost import Branch, branch_cost
+from taojax.core.se2 import inverse, transform
+from taojax.runtime.answer import joint_terms
+from taojax.runtime.grid import Row, largest
+from taojax.runtime.joint import init_joint, joint_step
+from taojax.runtime.maps import MapTables, map_tables
+from taojax.runtime.scale import rescale
+from taojax.runtime.stream import Frame, cost_params
+
+MOST_AT_ONCE = 32
+"""Units under one `vmap` at most, where vmap is used at all."""
+
+MEMORY_BYTES = 1 << 30
+"""Tables and rings of the units under one `vmap` may take so much."""
+
+
+class RankLog(eqx.Module):
+    """Frames in front of which a whole window of frames that never were is put."""
+
+    p: Float[Array, "t n 2"]
+    """Local positions of every frame's window, as a stream would hold them."""
+
+    q: Float[Array, "s k 2"]
+    similarity: Float[Array, "s k"]
+    has_anchor: Bool[Array, "s k"]
+
+
+class RankUnit(eqx.Module):
+    """One fit, and what is read off it without a second one. Leaves gain an axis under `vmap`."""
+
+    config: StreamConfig
+    window: Int[Array, "*u"]
+    gamma: Float[Array, "*u g"]
+    """Weights of the similarity term; repeated to a common length."""
+
+    branches: Int[Array, "*u g"]
+
+
+class JointUnit(eqx.Module):
+    """One joint configuration."""
+
+    config: StreamConfig
+    tables: MapTables
+    window: Int[Array, "*u"]
+    seeds: Int[Array, "*u"]
+    branches: Int[Array, "*u"]
+
+
+class Unit(NamedTuple):
+    """One piece of work: rows of the grid and the arguments that give their signals."""
+
+    rows: tuple[int, ...]
+    arguments: RankUnit | JointUnit
+
+
+def _scalars(config: StreamConfig, row: Row, **sizes: Any) -> StreamConfig:
+    """Return settings whose numbers are arrays, so that one compilation serves every row."""
+    free = [f.name for f in dataclasses.fields(config) if not f.metadata.get("static", False)]
+    numbers: dict[str, Any] = {
+        name: jnp.asarray(row.get(name, getattr(config, name)), jnp.float32) for name in free
+    }
+    return dataclasses.replace(config, **numbers, **sizes)
+
+
+def rank_log(tables: MapTables, frames: Frame, window: int, branches: int) -> RankLog:
+    """Prepare a recording for rank branches.
+
+    Args:
+        tables: the map.
+        frames: checked at the door; leaves with a leading time axis.
+        window: longest window of the sweep.
+        branches: most branches of the sweep.
+    """
+    room = max(0, branches - frames.index.shape[1])
+    index = jnp.pad(frames.index[:, :branches], ((0, 0), (0, room)), constant_values=-1)
+    similarity = jnp.pad(frames.similarity[:, :branches], ((0, 0), (0, room)))
+    is_there = index >= 0
+    before = ((window - 1, 0), (0, 0))
+
+    def push(p: Array, odometry: Array) -> tuple[Array, Array]:
+        moved = transform(inverse(odometry)[None], p)
+        p = jnp.concatenate([moved[1:], jnp.zeros((1, 2))])
+        return p, p
+
+    return RankLog(
+        p=jax.lax.scan(push, jnp.zeros((window, 2)), frames.odometry)[1],
+        q=jnp.pad(jnp.where(is_there[..., None], tables.grid.xy[index], 0.0), (*before, (0, 0))),
+        similarity=jnp.pad(jnp.where(is_there, similarity, 0.0), before),
+        has_anchor=jnp.pad(is_there, before),
+    )
+
+
+def rank_signals(tables: MapTables, log: RankLog, unit: RankUnit) -> Float[Array, "g t"]:
+    """Return the signal of a stream with rank branches, for every gamma and K of a unit."""
+    n, k = log.p.shape[1], log.q.shape[1]
+    unweighted = dataclasses.replace(unit.config, gamma_similarity=jnp.ones(()))
+    params, age = cost_params(unweighted, tables), jnp.arange(n)[::-1]
+    is_branch = jnp.arange(k)[None] < unit.branches[:, None]
+
+    def at(t: Array) -> Float[Array, " g"]:
+        seen = (age < unit.window) & (age <= t)
+        weight = seen.astype(jnp.float32)
+        cut = lambda leaf: jnp.swapaxes(jax.lax.dynamic_slice_in_dim(leaf, t, n), 0, 1)
+        branches = Branch(cut(log.q), cut(log.similarity), cut(log.has_anchor))
+        costs = jax.vmap(branch_cost, in_axes=(None, None, 0, None))(
+            params, log.p[t], branches, weight / jnp.sum(weight)
+        )
+        total = costs.geom[None] + costs.vel[None] + unit.gamma[:, None] * costs.sim[None]
+        return jnp.min(jnp.where(is_branch, total, jnp.inf), axis=1)
+
+    return jax.lax.map(at, jnp.arange(log.p.shape[0])).T
+
+
+def joint_signals(frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
+    """Return the signal of a stream with joint branches.
+
+    Args:
+        frames: checked at the door.
+        unit: `config` holds the sizes of the arrays. Its lists are longer than the recording's by
+            the number of seeds, because a candidate that may not seed moves behind those that may.
+    """
+    config, tables = unit.config, unit.tables
+    n, n_seeds, c = config.joint_window, config.joint_seeds, frames.index.shape[1]
+    place = jnp.arange(config.branches)
+    source = jnp.where(place < unit.seeds, place, place - (n_seeds - unit.seeds))
+    is_used = (place < unit.seeds) | (place >= n_seeds)
+    is_used &= (source >= 0) & (source < jnp.minimum(unit.branches, c))
+    source = jnp.where(is_used, source, 0)
+
+    def advance(state: Any, frame: Frame) -> tuple[Any, Array]:
+        index = jnp.where(is_used, frame.index[source], -1)
+        scaled = rescale(tables.scale, jnp.where(index >= 0, frame.similarity[source], 0.0))
+        # Frames that leave the shorter window: the slot to be written next has age n.
+        age = jnp.mod(state.slot - jnp.arange(n) - 1, n) + 1
+        kept = eqx.tree_at(lambda s: s.is_filled, state, state.is_filled & (age < unit.window))
+        state, reading = joint_step(config, tables, kept, frame.odometry, index, scaled)
+        delta_m = cost_params(config, tables).delta_m
+        return state, joint_terms(config, delta_m, tables, reading)["tao"]
+
+    start = init_joint(config, tables.grid.xy.shape[0])
+    return jax.lax.scan(advance, start, frames)[1][None]
+
+
+def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
+    """Group the rank rows of a grid by the fit that they share."""
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    names = ("lambda_velocity", "tau_masks", "delta_spacings", "mask_deltas", "window")
+    for number, row in enumerate(rows):
+        if row["association"] == "rank":
+            groups.setdefault(tuple(row[name] for name in names), []).append(number)
+    width = max(map(len, groups.values()), default=0)
+    units = []
+    for members in groups.values():
+        padded = members + members[-1:] * (width - len(members))
+        column = lambda name, of=padded: np.array([rows[number][name] for number in of])
+        row = rows[members[0]]
+        units.append(
+            Unit(
+                tuple(members),
+                RankUnit(
+                    config=_scalars(config, row),
+                    window=jnp.asarray(int(row["window"])),
+                    gamma=jnp.asarray(column("gamma_similarity"), jnp.float32),
+                    branches=jnp.asarray(column("branches"), jnp.int32),
+                ),
+            )
+        )
+    return units
+
+
+def delta_tables(
+    tables: MapTables, poses: np.ndarray, config: StreamConfig, deltas: Sequence[float]
+) -> dict[float, MapTables]:
+    """Return the map's tables for each Huber threshold, in arrays of one size."""
+    made = {
+        delta: map_tables(poses, dataclasses.replace(config, delta_spacings=delta)).grid
+        for delta in deltas
+    }
+    cells = max((len(grid.nearest) for grid in made.values()), default=0)
+    return {
+        # A look-up stays inside the grid's own shape, so that what is added is never read.
+        delta: eqx.tree_at(
+            lambda t: t.grid,
+            tables,
+            eqx.tree_at(lambda g: g.nearest, grid, jnp.pad(
+                grid.nearest, (0, cells - len(grid.nearest)), constant_values=-1)),
+        )
+        for delta, grid in made.items()
+    }  # fmt: skip
+
+
+def joint_units(
+    rows: Sequence[Row], config: StreamConfig, tables: MapTables, poses: np.ndarray
+) -> list[Unit]:
+    """Return one unit per joint row of a grid."""
+    mine = {n: row for n, row in enumerate(rows) if row["association"] == "joint"}
+    if not mine:
+        return []
+    chosen = list(mine.values())
+    deltas = dict.fromkeys(float(row["delta_spacings"]) for row in chosen)
+    of_delta = delta_tables(tables, poses, config, list(deltas))
+    seeds = largest(chosen, "joint_seeds")
+    sizes = {
+        "joint_window": largest(chosen, "joint_window"),
+        "joint_seeds": seeds,
+        "branches": largest(chosen, "branches") + seeds,
+    }
+    return [
+        Unit((number,), JointUnit(
+            config=_scalars(config, row, **sizes),
+            tables=of_delta[float(row["delta_spacings"])],
+            window=jnp.asarray(int(row["joint_window"])),
+            seeds=jnp.asarray(int(row["joint_seeds"])),
+            branches=jnp.asarray(int(row["branches"])),
+        ))
+        for number, row in mine.items()
+    ]  # fmt: skip
+
+
+def at_once(unit: Unit, backend: str) -> int:
+    """Return how many units go under one `vmap`; 1 means a loop.
+
+    On a CPU the loop wins, measured by `python -m benchmarks sweep_speed`: vmap takes 2 to 3 times
+    the time per configuration, for both associations, at every batch size. Elsewhere a batch fills
+    the device (not measured), within `MEMORY_BYTES`.
+    """
+    if backend == "cpu":
+        return 1
+    n_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(unit.arguments))
+    if isinstance(unit.arguments, JointUnit):
+        n_bytes += unit.arguments.config.joint_window * len(unit.arguments.tables.grid.xy)
+    return max(1, min(MOST_AT_ONCE, MEMORY_BYTES // n_bytes))
+
+
+def evaluate(
+    signals: Callable[[Any], Array], units: Sequence[Unit], *, batch: int
+) -> Iterator[tuple[tuple[int, ...], np.ndarray]]:
+    """Work through units, one after the other or `batch` at once under `vmap`.
+
+    Args:
+        signals: arguments of one unit -> (rows, t).
+        units: of one association, of equal shapes.
+        batch: from `at_once`.
+
+    Yields:
+        Row numbers and their signals `(rows, t)`, as they are finished.
+    """
+    if batch > 1:
+        run = jax.jit(jax.vmap(signals))
+        for start in range(0, len(units), batch):
+            part = list(units[start : start + batch])
+            padded = [*part, *part[-1:] * (batch - len(part))]
+            stacked = jax.tree.map(lambda *x: jnp.stack(x), *(u.arguments for u in padded))
+            found = np.asarray(run(stacked))
+            rows = tuple(row for unit in part for row in unit.rows)
+            yield (
+                rows,
+                np.concatenate([f[: len(u.rows)] for f, u in zip(found, part, strict=False)]),
+            )
+        return
+    run = jax.jit(signals)
+    for unit in units:
+        yield unit.rows, np.asarray(run(unit.arguments))[: len(unit.rows)]
+
+
+def plan(
+    rows: Sequence[Row], config: StreamConfig, tables: MapTables, poses: np.ndarray, frames: Frame
+) -> list[tuple[Callable[[Any], Array], list[Unit]]]:
+    """Return what to compute: per association a function of one unit, and its units."""
+    work: list[tuple[Callable[[Any], Array], list[Unit]]] = []
+    if ranked := rank_units(rows, config):
+        mine = [row for row in rows if row["association"] == "rank"]
+        log = rank_log(tables, frames, largest(mine, "window"), largest(mine, "branches"))
+        work.append((partial(rank_signals, tables, log), ranked))
+    if joint := joint_units(rows, config, tables, poses):
+        work.append((partial(joint_signals, frames), joint))
+    return work

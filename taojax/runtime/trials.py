@@ -1,0 +1,74 @@
+"""Many short logs at once: every trial is replayed from a fresh start."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from taojax.config import Config, StreamConfig
+from taojax.runtime.maps import MapTables
+from taojax.runtime.stream import Frame, StreamRecord, replay
+
+CHUNK_TRIALS = 32
+"""Trials per call; one compilation, and a progress bar that moves."""
+
+
+def batch_trials() -> int:
+    """Return how many trials run side by side, by where jax runs.
+
+    On a CPU one after the other: a step already fills its vector units with branches. Measured on
+    two cores: 2.52, 3.12, 2.44 and 2.37 ms a frame with 1, 2, 8 and 32 trials side by side, and
+    one alone compiles fastest. An accelerator is empty without many; that number is no
+    measurement.
+    """
+    return 1 if jax.default_backend() == "cpu" else CHUNK_TRIALS
+
+
+@jax.jit(static_argnames="batch")
+def _replay_each(
+    config: StreamConfig, tables: MapTables, frames: Frame, batch: int
+) -> StreamRecord:
+    one = lambda trial: replay(config, tables, trial)[1]
+    return jax.lax.map(one, frames, batch_size=None if batch == 1 else batch)
+
+
+def in_trials(frames: Frame, trial_frames: int) -> Frame:
+    """Cut a log of `B * trial_frames` frames into B trials: leaves get a leading axis."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, trial_frames, *leaf.shape[1:]), frames)
+
+
+def replay_trials(
+    config: Config,
+    tables: MapTables,
+    frames: Frame,
+    *,
+    batch: int | None = None,
+    progress: bool = False,
+) -> StreamRecord:
+    """Replay every trial from a fresh start.
+
+    Args:
+        config: settings; only the stream part is used.
+        tables: the map, the same for all.
+        frames: leaves with two leading axes, trial and time, from `in_trials`.
+        batch: trials side by side; `batch_trials()` when omitted.
+        progress: draw a bar on stderr.
+
+    Returns:
+        One record per frame, trial after trial on one leading axis, as numpy arrays.
+    """
+    frames = jax.tree.map(np.asarray, frames)
+    n_trials, n_frames = frames.odometry.shape[:2]
+    batch, width = batch or batch_trials(), min(CHUNK_TRIALS, n_trials)
+    parts = []
+    with tqdm(total=n_trials * n_frames, unit="frame", disable=not progress, leave=False) as bar:
+        for start in range(0, n_trials, width):
+            # The last chunk is filled up with its last trial; those records are dropped.
+            chosen = np.minimum(np.arange(start, start + width), n_trials - 1)
+            n = min(width, n_trials - start)
+            chunk = jax.tree.map(lambda leaf, c=chosen: jnp.asarray(leaf[c]), frames)
+            records = _replay_each(config.stream, tables, chunk, batch)
+            parts.append(jax.tree.map(lambda leaf, m=n: np.asarray(leaf)[:m], records))
+            bar.update(n * n_frames)
+    together = lambda *leaves: np.concatenate(leaves).reshape(-1, *leaves[0].shape[2:])
+    return jax.tree.map(together, *parts)
