@@ -27,6 +27,8 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, help="folder to make (default runs/refinement/TIME)"
     )
     refinement.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
+    speed = verbs.add_parser("sweep_speed", help="a loop against vmap over configurations")
+    speed.add_argument("--out", type=Path, help="folder to make (default runs/sweep_speed/TIME)")
     return parser
 
 
@@ -45,6 +47,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import refinement
 
         refinement.run(out, args.data, quick=args.quick)
+    elif args.verb == "sweep_speed":
+        from benchmarks import sweep_speed
+
+        sweep_speed.run(out)
     else:
         from benchmarks import quality
 

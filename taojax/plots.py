@@ -5,6 +5,7 @@ repeat what they say.
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -225,15 +226,18 @@ def recovery_curves(
     """Draw the share of trials recovered over the frames after the jump.
 
     Args:
-        curves: method -> (share, lower, upper) after 1, 2, ... frames; the band is the interval.
-        strong: methods drawn with a thick line, on top.
+        curves: method -> (share, lower, upper) after 1, 2, ... frames.
+        strong: methods drawn with a thick line and a band for the interval; a dozen bands would
+            hide one another.
         ax: where to draw.
     """
     for number, (name, curve) in enumerate(curves.items()):
         frame, is_strong = np.arange(1, len(curve) + 1), name in strong
         colour, style = CYCLE[number % len(CYCLE)], STYLES[(number + number // 7) % len(STYLES)]
         top = 3 if is_strong else 2
-        ax.fill_between(frame, *curve[:, 1:].T, color=colour, alpha=0.12, linewidth=0, zorder=top)
+        if is_strong:
+            low, high = curve[:, 1:].T
+            ax.fill_between(frame, low, high, color=colour, alpha=0.2, linewidth=0, zorder=1)
         ax.plot(
             frame, curve[:, 0], color=colour, linestyle=style, label=name, zorder=top,
             linewidth=2.2 if is_strong else 1.1,
@@ -265,17 +269,17 @@ def kidnap_example(
     """
     ax.scatter(*map_m.T, s=2, color="#cccccc", linewidths=0, label="map", zorder=1)
     edges = [0, *jumps.tolist(), len(query_m)]
-    for number, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for number, (a, b) in enumerate(pairwise(edges)):
         label = "true path" if number == 0 else None
         ax.plot(*query_m[a:b].T, color=INK, linewidth=1.0, zorder=2, label=label)
         ax.annotate(
-            f"{number + 1}", query_m[a], xytext=(7, 7), textcoords="offset points", fontsize=9,
-            weight="bold", color=INK, zorder=9,
+            f"{number + 1}", tuple(query_m[a]), xytext=(7, 7), textcoords="offset points",
+            fontsize=9, weight="bold", color=INK, zorder=9,
         )  # fmt: skip
     for number, jump in enumerate(jumps):
         label = "carried to" if number == 0 else None
         ax.annotate(
-            "", query_m[jump], query_m[jump - 1], zorder=3,
+            "", tuple(query_m[jump]), tuple(query_m[jump - 1]), zorder=3,
             arrowprops={"arrowstyle": "->", "color": PALE, "linestyle": ":"},
         )  # fmt: skip
         ax.plot([], [], color=PALE, linestyle=":", label=label)

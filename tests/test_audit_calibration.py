@@ -91,7 +91,9 @@ def test_too_few_frames_of_a_class_give_a_fallback_that_says_so(rng, n_out):
 def test_without_labels_the_weights_are_the_prior_and_there_is_no_threshold(rng):
     signals, _ = frames(rng, 20, 20)
     model = calibration.fit(split_of(signals, np.full(40, "grey")))
-    np.testing.assert_allclose(model.weight, list(calibration.prior(calibration.LIST_RECALL).values()))
+    np.testing.assert_allclose(
+        model.weight, list(calibration.prior(calibration.LIST_RECALL).values())
+    )
     assert np.isnan(model.threshold)
 
 
@@ -121,12 +123,13 @@ def test_reliability_bins_hold_equal_counts(rng):
     assert (np.diff(bins.promised) > 0).all()
 
 
-def judged(status, tao, *, in_map=True):
+def judged(status, tao, *, in_map=True, stale=0.0):
     n = len(status)
     signals = {
         "frame": np.arange(n),
         "status": np.array(status, dtype=object),
         "tao": np.array(tao),
+        "stale": np.full(n, stale),
     }
     label = np.full(4, "in_map" if in_map else "map_out")
     split = split_of({"tao": np.array([1.0, 3.0, 1.0, 3.0])}, label)
@@ -153,6 +156,20 @@ def test_a_frame_that_cannot_be_judged_is_abstained_on_and_says_why(status):
     verdicts = judged([status, "ok"], [0.0, 0.0])
     assert verdicts["verdict"].tolist() == ["abstain", "accept"]
     assert verdicts["reason"][0].startswith(status)
+
+
+def test_a_place_that_the_newest_frame_does_not_support_is_never_accepted():
+    verdicts = judged(["ok", "ok"], [0.0, 50.0], stale=1.0)
+    assert verdicts["verdict"].tolist() == ["abstain", "reject"]
+    assert verdicts["reason"][0].startswith("stale")
+
+
+def test_the_map_alone_sets_the_prior():
+    blurred, distinct = calibration.prior(0.3), calibration.prior(1.0)
+    assert blurred == calibration.BLURRED
+    assert distinct == calibration.DISTINCT
+    between = calibration.prior(0.75)["recursive"]
+    assert blurred["recursive"] < between < distinct["recursive"]
 
 
 def test_without_a_threshold_every_frame_is_abstained_on():

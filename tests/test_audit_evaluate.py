@@ -111,7 +111,9 @@ def test_the_probability_is_scored_on_the_test_split_alone(case):
 def test_verdicts_cover_every_frame_and_warming_up_abstains(case):
     table = read_table(case[0] / "verdicts.csv", "verdicts")
     assert table["verdict"][:2].tolist() == ["abstain", "abstain"]
-    assert set(table["verdict"][2:]) == {"accept", "reject"}
+    assert set(table["verdict"][2:]) == {"accept", "reject", "abstain"}
+    kinds = {reason.split(":")[0] for reason in table["reason"][table["verdict"] == "abstain"]}
+    assert kinds <= {"warming_up", "stale", "lost"}
 
 
 def test_the_micro_audit_has_no_grey_zone(case):

@@ -52,7 +52,7 @@ def test_lists_without_any_candidate_have_no_pose(rng, tmp_path):
     assert np.isnan(run.signals["x_m"].astype(float)).all()
 
 
-def test_a_verdict_at_run_time_needs_a_status_of_ok(rng, tmp_path):
+def test_an_acceptance_at_run_time_needs_a_status_of_ok_and_a_fresh_frame(rng, tmp_path):
     from taojax.detector import Detector
     from taojax.runtime.score import decide
 
@@ -61,9 +61,10 @@ def test_a_verdict_at_run_time_needs_a_status_of_ok(rng, tmp_path):
     got = decide(
         detector,
         {
-            "frame": np.arange(3),
-            "status": np.array(["ok", "lost", "ok"], dtype=object),
-            "tao": np.array([-1.0, -1.0, 1.0]),
+            "frame": np.arange(4),
+            "status": np.array(["ok", "lost", "ok", "ok"], dtype=object),
+            "tao": np.array([-1.0, -1.0, 1.0, -1.0]),
+            "stale": np.array([0.0, 0.0, 1.0, 1.0]),
         },
     )
-    assert got["verdict"].tolist() == ["accept", "abstain", "reject"]
+    assert got["verdict"].tolist() == ["accept", "abstain", "reject", "abstain"]

@@ -263,19 +263,31 @@ def test_a_frame_whose_candidates_all_miss_does_not_lose_the_place(rng):
     assert error < 3 * float(tables.spacing_m)
 
 
-def test_a_robot_carried_off_in_the_dark_is_lost_until_a_branch_is_established(rng):
-    tables, a = log(rng, n=60)
-    # Two drives spliced: odometry says nothing, the places jump across the loop.
-    frames = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:25], leaf[42:], leaf[:15]]), a)
-    dark = Frame(frames.odometry, frames.index.at[20:32].set(-1), frames.similarity)
-    config = StreamConfig(window=12, branches=6, association="rank", delta_spacings=0.7)
-    _, records = replay(config, tables, dark)
-    words = [STATUSES[s] for s in np.asarray(records.status)]
-    assert set(words[2:20]) == {"ok"}
-    assert set(words[20:32]) == {"no_candidates"}
-    assert "lost" in words[33:38]
-    assert set(words[42:]) == {"ok"}
-    _, staying = replay(config, tables, Frame(a.odometry, a.index.at[20:32].set(-1), a.similarity))
+def kidnapped(rng):
+    """Two drives spliced: odometry says nothing, the places jump across the loop."""
+    tables, frames = log(rng, n=60)
+    half = np.r_[0:25, 40:60]
+    return tables, jax.tree.map(lambda leaf: leaf[half], frames), loop(60)[half], frames
+
+
+def test_a_kidnapped_robot_is_found_again_within_a_few_frames(rng):
+    tables, frames, truth, _ = kidnapped(rng)
+    _, records = replay(StreamConfig(window=8, branches=6), tables, frames)
+    error = np.linalg.norm(np.asarray(records.pose)[:, :2] - truth[:, :2], axis=1)
+    assert (error[5:25] < 3 * float(tables.spacing_m)).all()
+    assert (error[25 + 6 :] < 3 * float(tables.spacing_m)).all()
+
+
+def test_between_a_kidnap_and_an_established_branch_nothing_fresh_is_ok(rng):
+    tables, frames, truth, whole = kidnapped(rng)
+    _, records = replay(StreamConfig(window=8, branches=6), tables, frames)
+    error = np.linalg.norm(np.asarray(records.pose)[:, :2] - truth[:, :2], axis=1)
+    words = np.array([STATUSES[s] for s in np.asarray(records.status)])
+    believed = (words == "ok") & (np.asarray(records.signals["stale"]) == 0)
+    assert not (believed & (error > 5 * float(tables.spacing_m)))[25:].any()
+    assert "lost" in words[25:32]
+    assert words[-1] == "ok"
+    _, staying = replay(StreamConfig(window=8, branches=6), tables, whole)
     assert "lost" not in [STATUSES[s] for s in np.asarray(staying.status)]
 
 

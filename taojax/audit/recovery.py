@@ -123,7 +123,7 @@ def frames_to_recovery(right: Bool[np.ndarray, " n"], stay_frames: int) -> float
     if len(right) < stay_frames:
         return np.inf
     windows = np.lib.stride_tricks.sliding_window_view(right, stay_frames)
-    return _first(windows.all(axis=1))
+    return _first(np.asarray(windows.all(axis=1)))
 
 
 def frozen_threshold(signal: Float[np.ndarray, " n"]) -> float:
@@ -186,7 +186,7 @@ def quantile(values: Float[np.ndarray, " n"], share: float) -> float:
     return found if np.isfinite(found) else float("nan")
 
 
-def wilson(count: float, n: int) -> tuple[float, float]:
+def wilson(count: int, n: int) -> tuple[float, float]:
     """Return the 95 % Wilson interval of a share; NaN without trials.
 
     Source:
@@ -212,7 +212,7 @@ def recovered_within(frames: Float[np.ndarray, " n"], most_frames: int) -> Float
     """
     n, rows = len(frames), []
     for limit in range(1, most_frames + 1):
-        count = float((frames <= limit).sum())
+        count = int((frames <= limit).sum())
         rows.append((count / n if n else np.nan, *wilson(count, n)))
     return np.array(rows)
 
@@ -226,7 +226,7 @@ def recovery_row(outcomes: Sequence[Outcome], dt_s: float) -> dict[str, Any]:
     """
     table = np.array(outcomes, float).reshape(-1, len(Outcome._fields))
     frames, metres, wrong, notice, again = table.T
-    n, good = len(table), float(np.isfinite(frames).sum())
+    n, good = len(table), int(np.isfinite(frames).sum())
     noticed = notice[np.isfinite(notice)]
     low, high = wilson(good, n)
     wrong_frames = float(wrong.mean()) if n else np.nan

@@ -87,7 +87,8 @@ def _tracks(run: Run, place_m: Float[np.ndarray, "t 2"]) -> dict[str, Track]:
     for name, track in (run.tracks or {}).items():
         away = np.hypot(*(track.pose[:, :2].astype(float) - place_m).T)
         error = np.where(track.has_pose, away, np.inf)
-        found[name] = Track(error, track.signal.astype(float), track.has_pose)
+        # Tables are plain CSV: a name in them holds no comma.
+        found[name.replace(",", "")] = Track(error, track.signal.astype(float), track.has_pose)
     return found
 
 
@@ -209,6 +210,8 @@ def recovery_rows(
     for method in methods(runs):
         for drift in levels(runs):
             found = measure(runs, method, drift, rules)
+            if not found.outcomes and method != "tao":
+                continue
             behind[method, drift] = found
             row = recovery_row(found.outcomes, runs[0].dt_s)
             rows.append(

@@ -34,6 +34,7 @@ def curves(behind: Mapping[tuple[str, str], Measured], *, simulated: str) -> Pic
     axes[0].set_ylabel("share of kidnaps recovered")
     lines, names = axes[0].get_legend_handles_labels()
     figure.legend(lines, names, loc="outside right center", frameon=False, fontsize=8)
+    least = min(n for _, _, n, _ in parts)
     columns = {
         "method": np.concatenate([[m] * MOST_FRAMES for m, *_ in parts]),
         "drift": np.concatenate([[d] * MOST_FRAMES for _, d, *_ in parts]),
@@ -43,8 +44,9 @@ def curves(behind: Mapping[tuple[str, str], Measured], *, simulated: str) -> Pic
     table = np.concatenate([curve for *_, curve in parts])
     columns |= {f"recovered{end}": table[:, i] for i, end in enumerate(("", "_lo", "_hi"))}
     caption = (
-        f"{simulated} Bands: pointwise 95 % Wilson intervals. Trials that end before they recover "
-        "stay failures in every curve; rivals ran on fewer trials, hence their wider bands."
+        f"{simulated} Bands: pointwise 95 % Wilson intervals, for legibility of our two alone; "
+        f"those of the rivals, which ran on fewer trials ({least} or more), are in the CSV. A "
+        "trial that ends before it recovers stays a failure."
     )
     return picture(figure, "recovery", "Recovery after a kidnap", caption, csv_text(columns))
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from taojax.audit import bootstrap, calibration, labels, metrics, tables
 from taojax.audit.figures import as_files
-from taojax.audit.sweep_figures import NO_SETTING, draw
+from taojax.audit.sweep_figures import NO_SETTING, draw, varied
 from taojax.audit.truth import read_truth
 from taojax.audit.verdicts import plain
 from taojax.config import Config
@@ -203,18 +203,22 @@ def top_table(table: Mapping[str, np.ndarray]) -> tables.Table:
     return {name: values[kept] for name, values in table.items()}
 
 
-def terminal_table(top: Mapping[str, np.ndarray]) -> str:
-    """Return the top rows as aligned text; a setting that no row has is left out."""
-    settings = [c for c in column_names("grid") if c not in ("config", "is_default", "is_in_grid")]
-    shown = ["config", *settings, "auroc_calibration", "far_at_95_calibration", "auroc_test"]
+def terminal_table(top: Mapping[str, np.ndarray], settings: list[str]) -> str:
+    """Return the top rows as aligned text.
+
+    Args:
+        top: from `top_table`.
+        settings: the columns that tell the rows apart.
+    """
+    shown = ["config", "association", *settings, "auroc_calibration", "auroc_test"]
     cell = lambda v: str(v) if isinstance(v, str) else "" if np.isnan(v) else plain(float(v))
     columns = [[name, *map(cell, top[name])] for name in shown]
-    columns = [c for c in columns if any(c[1:])]
     widths = [max(map(len, column)) for column in columns]
-    lines = zip(*columns, strict=True)
-    return "\n".join(
-        "  ".join(t.rjust(w) for t, w in zip(line, widths, strict=True)) for line in lines
-    )
+    rows = [
+        "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
+        for row in zip(*columns, strict=True)
+    ]
+    return "\n".join(rows)
 
 
 def evaluate_sweep(run: Path, truth: Path, config: Config) -> tuple[str, ...]:
@@ -249,7 +253,8 @@ def evaluate_sweep(run: Path, truth: Path, config: Config) -> tuple[str, ...]:
         }
         for drawn in draw(judgement.table):
             files |= as_files(drawn)
-        lines = [terminal_table(top), *lines]
+        every = np.ones(len(sealed.tao), bool)
+        lines = [terminal_table(top, varied(judgement.table, every)), *lines]
     files["audit.json"] = json.dumps(
         {"schema": 1, "run_seal": sealed.manifest["seal"], "truth_sha256": known.sha256,
          "gap_frames": gap, "chosen": judgement.chosen, "sentences": judgement.sentences}, indent=2

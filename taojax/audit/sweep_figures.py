@@ -15,6 +15,9 @@ from taojax.specs import column_names
 BAND = (10.0, 50.0, 90.0)
 """Percentiles over the other settings that a sensitivity curve shows."""
 
+LEAST_SPAN = 0.05
+"""AUROC axes and colours span at least this much, so that noise does not look like an effect."""
+
 NO_SETTING = ("config", "association", "is_default", "is_in_grid")
 """Columns of grid.csv that are no numeric setting."""
 
@@ -39,7 +42,7 @@ def heat_map(
     for (row, column), value in np.ndenumerate(values):
         is_dark = value < 0.5 * (low + high)
         ax.text(
-            column, row, f"{value:.2f}", ha="center", va="center", fontsize=7,
+            column, row, f"{value:.3f}", ha="center", va="center", fontsize=7,
             color="white" if is_dark else "black",
         )  # fmt: skip
     for axis, at in ((ax.xaxis, levels[0]), (ax.yaxis, levels[1])):
@@ -70,6 +73,13 @@ def sensitivity(
     return ax
 
 
+def _span(low: float, high: float) -> tuple[float, float]:
+    """Return limits at least `LEAST_SPAN` apart, within [0, 1]."""
+    pad = max(0.0, 0.5 * (LEAST_SPAN - (high - low)))
+    high = min(1.0, high + pad)
+    return min(low - pad, high - LEAST_SPAN), high
+
+
 def varied(table: Mapping[str, np.ndarray], mine: Bool[np.ndarray, " c"]) -> list[str]:
     """Return the settings that take more than one value among some rows."""
     names = [c for c in column_names("grid") if c not in NO_SETTING]
@@ -91,7 +101,7 @@ def draw(table: Mapping[str, np.ndarray]) -> list[Picture]:
 def _sensitivity(
     table: Mapping[str, np.ndarray], mine: np.ndarray, names: list[str], association: str
 ) -> Picture:
-    n_columns = min(3, len(names))
+    n_columns = 2 if len(names) == 4 else min(3, len(names))
     n_rows = -(-len(names) // n_columns)
     figure = Figure(figsize=(0.6 + 2.8 * n_columns, 0.7 + 2.3 * n_rows), layout="constrained")
     axes = np.atleast_1d(figure.subplots(n_rows, n_columns, sharey=True, squeeze=False)).ravel()
@@ -108,7 +118,11 @@ def _sensitivity(
         ax.set_visible(False)
     for ax in axes[::n_columns]:
         ax.set_ylabel("AUROC, calibration half")
-    axes[0].legend(frameon=False, fontsize=7)
+    low, high = _span(float(score[mine].min()), float(score[mine].max()))
+    axes[0].set_ylim(low - 0.02 * (high - low), high + 0.02 * (high - low))
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside upper center", ncol=3, frameon=False
+    )
     heads = ("setting", "value", "p10", "median", "p90", "best")
     csv = csv_text({h: np.array(c) for h, c in zip(heads, zip(*stacked, strict=True), strict=True)})
     caption = f"{int(mine.sum())} {association} configurations; band: 10 to 90 % over the others."
@@ -128,7 +142,8 @@ def _heat_maps(
         )
         cells[a, b] = x, y, mean
         stacked += [(a, u, b, v, mean[j, i]) for i, u in enumerate(x) for j, v in enumerate(y)]
-    limits = tuple(f([f(mean) for *_, mean in cells.values()]) for f in (np.min, np.max))
+    means = np.concatenate([mean.ravel() for *_, mean in cells.values()])
+    limits = _span(float(means.min()), float(means.max()))
     figure = Figure(figsize=(1.5 + 2.0 * (n - 1), 1.0 + 1.7 * (n - 1)), layout="constrained")
     axes = figure.subplots(n - 1, n - 1, squeeze=False)
     for (a, b), (x, y, mean) in cells.items():
@@ -137,7 +152,14 @@ def _heat_maps(
         ax.set(xlabel=a if row == n - 2 else "", ylabel=b if column == 0 else "")
     for row, column in itertools.product(range(n - 1), repeat=2):
         axes[row, column].set_visible(column <= row)
-    figure.colorbar(axes[0, 0].images[0], ax=axes, label="mean AUROC, calibration half", shrink=0.6)
+    figure.colorbar(
+        axes[0, 0].images[0],
+        ax=axes,
+        location="top",
+        shrink=0.6,
+        aspect=40,
+        label="mean AUROC, calibration half",
+    )
     heads = ("setting_x", "x", "setting_y", "y", "mean_auroc_calibration")
     csv = csv_text({h: np.array(c) for h, c in zip(heads, zip(*stacked, strict=True), strict=True)})
     caption = f"Mean over the other settings of {int(mine.sum())} {association} configurations."

@@ -1,4 +1,4 @@
-"""Kidnap logs on disk: sources read from a world or a data folder, logs written as a data folder."""
+"""Kidnap logs on disk: read a world or a data folder as source, write logs as a data folder."""
 
 import dataclasses
 import json
@@ -95,11 +95,13 @@ def _said(source: Source, logs: Sequence[Log]) -> list[str]:
         *source.notes,
         f"spliced: {len(logs)} logs of {TRIAL_FRAMES} frames with {n} simulated kidnaps; views are"
         " those of the source",
-        f"simulated odometry: true motion plus drift; end drift over {WINDOW_FRAMES} frames {drift}",
+        f"simulated odometry: true motion plus drift; over {WINDOW_FRAMES} frames {drift}",
     ]
 
 
-def _stacked(stamps: np.ndarray, columns: np.ndarray, names: Sequence[str]) -> dict:
+def _stacked(
+    stamps: np.ndarray, columns: np.ndarray, names: Sequence[str]
+) -> dict[str, np.ndarray]:
     return dict(zip(names, (stamps, *columns.T), strict=True))
 
 
@@ -118,10 +120,11 @@ def write_logs(source: Source, logs: Sequence[Log], folder: Path) -> None:
     dt_s = float(np.median(np.diff(source.query_poses[:, 0])))
     stamps = np.arange(len(rows)) * (dt_s if dt_s > 0 else 1.0)
     odometry = np.concatenate([log.odometry for log in logs])
-    columns = dict(zip(_POSE, source.map_poses.T, strict=True))
     truth = source.query_poses[rows]
     files = {
-        "map/poses.csv": table_text("map_poses", columns),
+        "map/poses.csv": table_text(
+            "map_poses", _stacked(source.map_poses[:, 0], source.map_poses[:, 1:], _POSE)
+        ),
         "query/odometry.csv": table_text("query_odometry", _stacked(stamps, odometry, _ODOMETRY)),
         "truth/query_poses.csv": table_text("query_poses", _stacked(stamps, truth[:, 1:], _POSE)),
         "truth/kidnaps.csv": table_text("kidnaps", _kidnaps(logs)),

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -10,7 +9,6 @@ from taojax.config import StreamConfig
 from taojax.core.adaptive import adaptive_mean
 from taojax.core.association import look_up
 from taojax.core.cost import BranchCost, squared_residuals
-from taojax.core.se2 import compose
 from taojax.runtime.joint import JointReading
 from taojax.runtime.maps import MapTables
 

@@ -27,7 +27,7 @@ LEAST_SLOPE = 0.2
 JUMP_EVIDENCE = 4.5
 """Evidence that makes a jump where a map tells all its places apart, in nats; more elsewhere."""
 
-LOCAL_DELTAS = 2.0
+LOCAL_DELTAS = 3.0
 """Branches nearer than this to the reported one are the same place, known more or less exactly."""
 
 LOCAL_FRAMES = 2.0
@@ -45,7 +45,7 @@ class Report(eqx.Module):
     """The newest frame's anchor, -1 where it supports nothing."""
 
     is_jump: Bool[Array, ""]
-    """The newest frames contradict the favourite: the robot was moved, or the favourite is wrong."""
+    """The newest frames contradict the favourite: the robot was moved, or it was wrong."""
 
     stale: Float[Array, ""]
     """Frames since the reported branch was last supported by one."""

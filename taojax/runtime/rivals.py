@@ -71,7 +71,7 @@ def rival_tracks(
     observations: Observations,
     frames: Frame,
     *,
-    most_logs: int | None = None,
+    most_logs: int,
     progress: bool = False,
 ) -> dict[str, SealedTrack]:
     """Run every rival on the same frames, each trial from a fresh start.
@@ -79,7 +79,7 @@ def rival_tracks(
     Args:
         observations: of the data folder.
         frames: what our own stream was given, one leading time axis.
-        most_logs: only so many trials, the first ones: rivals are slow; all when omitted.
+        most_logs: only so many trials, the first ones: rivals are slow.
         progress: draw a bar on stderr.
 
     Returns:
@@ -88,14 +88,14 @@ def rival_tracks(
     n_frames = len(observations.t_s)
     length = observations.trial_frames or n_frames
     poses = np.stack([observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
-    n_logs = min(n_frames // length, n_frames if most_logs is None else most_logs)
+    n_logs = min(n_frames // length, most_logs)
     tracks = {
         name: SealedTrack(
             np.full(n_frames, np.nan, np.float32),
             np.zeros((n_frames, 3), np.float32),
             np.zeros(n_frames, bool),
         )
-        for name in SYSTEMS
+        for name in (SYSTEMS if n_logs else ())
     }
     with tqdm(total=n_logs * len(SYSTEMS), unit="log", disable=not progress, leave=False) as bar:
         for log in range(n_logs):

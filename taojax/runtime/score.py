@@ -133,7 +133,6 @@ def score(
     config: Config,
     *,
     detector: Detector | None = None,
-    rivals: bool = False,
     rival_logs: int | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
@@ -147,8 +146,8 @@ def score(
         out: run folder to make; must be absent or empty.
         config: settings.
         detector: frozen numbers of an earlier audit; adds decisions.csv.
-        rivals: also run the rank association and every rival; adds tracks.npz.
-        rival_logs: rivals, but not the rank association, only on so many first trials.
+        rival_logs: also run the rank association and, on so many first trials (a folder without
+            trials is one), every rival; adds tracks.npz. None = neither.
         progress: draw a bar on stderr.
 
     Returns:
@@ -173,7 +172,7 @@ def score(
 
     records = replayed(config)
     tracks = None
-    if rivals:
+    if rival_logs is not None:
         literal = replayed(replace(config, {"association": "rank"}))
         said = rival_tracks(observations, frames, most_logs=rival_logs, progress=progress)
         tracks = {"tao_rank": sealed_track(literal, "tao_rank"), **said}

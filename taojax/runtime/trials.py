@@ -57,7 +57,6 @@ def replay_trials(
     Returns:
         One record per frame, trial after trial on one leading axis, as numpy arrays.
     """
-    frames = jax.tree.map(np.asarray, frames)
     n_trials, n_frames = frames.odometry.shape[:2]
     batch, width = batch or batch_trials(), min(CHUNK_TRIALS, n_trials)
     parts = []
@@ -66,7 +65,7 @@ def replay_trials(
             # The last chunk is filled up with its last trial; those records are dropped.
             chosen = np.minimum(np.arange(start, start + width), n_trials - 1)
             n = min(width, n_trials - start)
-            chunk = jax.tree.map(lambda leaf, c=chosen: jnp.asarray(leaf[c]), frames)
+            chunk = jax.tree.map(lambda leaf, c=chosen: jnp.asarray(np.asarray(leaf)[c]), frames)
             records = _replay_each(config.stream, tables, chunk, batch)
             parts.append(jax.tree.map(lambda leaf, m=n: np.asarray(leaf)[:m], records))
             bar.update(n * n_frames)

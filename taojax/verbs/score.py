@@ -1,11 +1,13 @@
 """`taojax score`: the robot side alone."""
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from taojax.errors import UsageError
 from taojax.verbs.common import Common, Dataset, config_of, flag, out_of, say
 
 
@@ -36,14 +38,18 @@ def run(args: Score) -> None:
 
     config = config_of(args)
     out = out_of(args, "score", config)
+    rival_logs = args.rival_logs
+    if rival_logs is not None and (rival_logs < 0 or not args.rivals):
+        raise UsageError("--rival-logs counts from 0 and goes with --rivals")
+    if args.rivals and rival_logs is None:
+        rival_logs = sys.maxsize
     detector = None if args.calibration is None else from_toml(args.calibration)
     manifest = score(
         args.dataset,
         out,
         config,
         detector=detector,
-        rivals=args.rivals,
-        rival_logs=args.rival_logs,
+        rival_logs=rival_logs,
         progress=args.progress,
     )
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
