@@ -81,12 +81,13 @@ def compare(recording: Recording, say: Callable[[str], None]) -> list[dict[str, 
 def whole(recording: Recording, name: str, grid: Grid, say: Callable[[str], None]) -> None:
     """Time a sweep from a bare recording to the last signal, compilation included."""
     rows, backend = expand(grid, StreamConfig()), jax.default_backend()
-    began, done = time.perf_counter(), 0
+    began, cpu, done = time.perf_counter(), time.process_time(), 0
     for signals, units in recording.work(rows):
         for members, _ in evaluate(signals, units, batch=at_once(units[0], backend)):
             done += len(members)
-    took = time.perf_counter() - began
-    say(f"{name}: {done} configurations x {len(recording.frames.index)} frames in {took:.1f} s")
+    took, cpu = time.perf_counter() - began, time.process_time() - cpu
+    frames = len(recording.frames.index)
+    say(f"{name}: {done} configurations x {frames} frames in {took:.1f} s, {cpu:.1f} s of CPU")
 
 
 def run(out: Path, *, say: Callable[[str], None] = print) -> None:

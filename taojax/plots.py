@@ -59,7 +59,7 @@ def retrieval_curve(recall: Mapping[float, np.ndarray], *, ax: Axes) -> Axes:
     ax.set_xticks([1, 5, 10, 100], ["1", "5", "10", "100"])
     ax.minorticks_off()
     ax.grid(alpha=0.25)
-    ax.legend(title="right within", frameon=False)
+    ax.legend(title="right within", frameon=False, loc="lower right")
     return ax
 
 
@@ -152,7 +152,7 @@ def curves(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], *, x: str, y: str
         ax.plot(right, up, color=CYCLE[number], linestyle=STYLES[number], linewidth=1.3, label=name)
     ax.set(xlabel=x, ylabel=y, xlim=(-0.01, 1.01), ylim=(-0.01, 1.01))
     ax.grid(alpha=0.25)
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(frameon=False, fontsize=8, loc="lower right")
     return ax
 
 

@@ -234,6 +234,18 @@ def command(*words):
     )  # fmt: skip
 
 
+def test_help_shows_an_example_and_imports_neither_jax_nor_equinox():
+    code = (
+        "import sys\nfrom taojax.cli import main\n"
+        "try:\n    main(['kidnap', '--help'])\n"
+        "except SystemExit as stop:\n    assert not stop.code\n"
+        "print([m for m in sys.modules if m in ('jax', 'equinox', 'pandas', 'matplotlib')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "Example: taojax kidnap" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory, source):
     folder = tmp_path_factory.mktemp("kidnap")

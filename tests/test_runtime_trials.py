@@ -10,7 +10,7 @@ from conftest import write_folder
 
 from taojax import records
 from taojax.cli import main
-from taojax.config import Config, StreamConfig
+from taojax.config import Config, StreamConfig, replace
 from taojax.errors import InputError
 from taojax.runtime import rivals
 from taojax.runtime.maps import map_tables
@@ -19,6 +19,9 @@ from taojax.runtime.stream import Frame
 from taojax.runtime.trials import in_trials, replay_trials
 
 SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+RANK = replace(SMALL, {"association": "rank"})
+"""Compiles in a fraction of the time; what is tested does not depend on it."""
+
 LENGTH = 10
 
 
@@ -34,14 +37,17 @@ def trials():
     return map_tables(poses, SMALL.stream), frames
 
 
-@pytest.mark.parametrize("batch", [1, 2, None])
-def test_trials_equal_separate_replays(batch, trials):
+@pytest.mark.parametrize(
+    ("association", "batch"), [("rank", 1), ("rank", 2), ("rank", None), ("joint", 2)]
+)
+def test_trials_equal_separate_replays(association, batch, trials):
     tables, frames = trials
-    together = replay_trials(SMALL, tables, in_trials(frames, LENGTH), batch=batch)
+    config = replace(SMALL, {"association": association})
+    together = replay_trials(config, tables, in_trials(frames, LENGTH), batch=batch)
     assert together.pose.shape == (5 * LENGTH, 3)
     for number in range(5):
         cut = slice(number * LENGTH, (number + 1) * LENGTH)
-        alone = replay_log(SMALL, tables, jax.tree.map(lambda leaf, c=cut: leaf[c], frames))
+        alone = replay_log(config, tables, jax.tree.map(lambda leaf, c=cut: leaf[c], frames))
         part = jax.tree.map(lambda leaf, c=cut: leaf[c], together)
         np.testing.assert_array_equal(part.status, alone.status)
         np.testing.assert_array_equal(part.has_pose, alone.has_pose)
@@ -54,9 +60,9 @@ def test_trials_equal_separate_replays(batch, trials):
 def test_more_trials_than_one_chunk(trials, monkeypatch):
     tables, frames = trials
     cut = in_trials(frames, LENGTH)
-    whole = replay_trials(SMALL, tables, cut)
+    whole = replay_trials(RANK, tables, cut)
     monkeypatch.setattr("taojax.runtime.trials.CHUNK_TRIALS", 2)
-    chunked = replay_trials(SMALL, tables, cut)
+    chunked = replay_trials(RANK, tables, cut)
     np.testing.assert_array_equal(whole.status, chunked.status)
     np.testing.assert_allclose(whole.pose, chunked.pose, atol=1e-5)
 
@@ -64,7 +70,7 @@ def test_more_trials_than_one_chunk(trials, monkeypatch):
 def test_a_folder_of_trials_starts_afresh_every_time(rng, tmp_path):
     folder = write_folder(tmp_path / "data", rng)
     (folder / "about.toml").write_text("trial_frames = 25\n")
-    score(folder, tmp_path / "run", SMALL)
+    score(folder, tmp_path / "run", RANK)
     signals = records.read_run(tmp_path / "run").signals
     assert signals["frame"].tolist() == list(range(50))
     warm = signals["status"] == "warming_up"
@@ -80,7 +86,7 @@ def two_rivals(monkeypatch):
 def test_rivals_are_sealed_and_read_back(rng, tmp_path, two_rivals):
     folder = write_folder(tmp_path / "data", rng)
     (folder / "about.toml").write_text("trial_frames = 25\n")
-    manifest = score(folder, tmp_path / "run", SMALL, rival_logs=1)
+    manifest = score(folder, tmp_path / "run", RANK, rival_logs=1)
     run = records.read_run(tmp_path / "run")
     assert manifest["tracks"] == ["tao_rank", "mht", "seqslam"]
     assert run.tracks is not None
@@ -98,8 +104,8 @@ def test_rivals_are_sealed_and_read_back(rng, tmp_path, two_rivals):
 
 def test_rivals_leave_our_own_bytes_alone(rng, tmp_path, two_rivals):
     folder = write_folder(tmp_path / "data", rng)
-    score(folder, tmp_path / "a", SMALL)
-    score(folder, tmp_path / "b", SMALL, rival_logs=1)
+    score(folder, tmp_path / "a", RANK)
+    score(folder, tmp_path / "b", RANK, rival_logs=1)
     for name in records.SEALED:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert records.read_run(tmp_path / "a").tracks is None
@@ -110,7 +116,7 @@ def test_rivals_of_a_list_folder(rng, tmp_path, two_rivals):
     index = rng.integers(0, 60, (50, 7)).astype(np.int32)
     similarity = -np.sort(-rng.random((50, 7)).astype(np.float32), axis=1)
     np.savez(folder / "query/retrievals.npz", index=index, similarity=similarity)
-    score(folder, tmp_path / "run", SMALL, rival_logs=1)
+    score(folder, tmp_path / "run", RANK, rival_logs=1)
     tracks = records.read_run(tmp_path / "run").tracks
     assert tracks is not None
     assert np.isfinite(tracks["seqslam"].signal).all()
@@ -118,7 +124,7 @@ def test_rivals_of_a_list_folder(rng, tmp_path, two_rivals):
 
 def test_a_flipped_byte_in_the_tracks_breaks_the_seal(rng, tmp_path, two_rivals):
     folder = write_folder(tmp_path / "data", rng)
-    score(folder, tmp_path / "run", SMALL, rival_logs=0)
+    score(folder, tmp_path / "run", RANK, rival_logs=0)
     path = tmp_path / "run" / "tracks.npz"
     raw = bytearray(path.read_bytes())
     raw[len(raw) // 2] ^= 1
@@ -129,7 +135,7 @@ def test_a_flipped_byte_in_the_tracks_breaks_the_seal(rng, tmp_path, two_rivals)
 
 def test_the_names_of_the_tracks_are_under_the_seal(rng, tmp_path, two_rivals):
     folder = write_folder(tmp_path / "data", rng)
-    score(folder, tmp_path / "run", SMALL, rival_logs=0)
+    score(folder, tmp_path / "run", RANK, rival_logs=1)
     path = tmp_path / "run" / "manifest.json"
     manifest = json.loads(path.read_text())
     manifest["tracks"] = manifest["tracks"][::-1]

@@ -244,7 +244,7 @@ def evaluate_sweep(run: Path, truth: Path, config: Config) -> tuple[str, ...]:
     gap = int(np.nanmax([sealed.grid["window"], sealed.grid["joint_window"]]))
     judgement = judge(sealed, label, config, gap_frames=gap)
     files: dict[str, str | bytes] = {}
-    lines = list(judgement.sentences)
+    lines = [*judgement.sentences, *(f"Note: {note}." for note in sealed.manifest["notes"])]
     if judgement.chosen is not None:
         top = top_table(judgement.table)
         # The printed table is the top; sweep.csv itself holds every row.

@@ -240,9 +240,9 @@ def joint_units(
 def at_once(unit: Unit, backend: str) -> int:
     """Return how many units go under one `vmap`; 1 means a loop.
 
-    On a CPU the loop wins, measured by `python -m benchmarks sweep_speed`: vmap takes 2 to 3 times
-    the time per configuration, for both associations, at every batch size. Elsewhere a batch fills
-    the device (not measured), within `MEMORY_BYTES`.
+    On a CPU the loop wins: `python -m benchmarks sweep_speed` found vmap to take twice the CPU
+    time per unit, for both associations and every batch size. Elsewhere a batch fills the device
+    (assumed, not measured), within `MEMORY_BYTES`.
     """
     if backend == "cpu":
         return 1
