@@ -1,6 +1,12 @@
 """`python -m benchmarks sweep_speed`: a loop against vmap, and how long a whole sweep takes.
 
-RESULT_HERE
+On a CPU the loop wins. CPU milliseconds per unit of work on 2 cores (1,000 frames, K = 100; wall
+times are as long or longer, the machine was shared): rank 244 in a loop, 560 under vmap over 4
+units, 585 over 16; joint 326 in a loop, 736 and 666 under vmap. One unit of rank work is one fit
+with all its values of gamma and K, so that the 256 default configurations are 32 units: 13 s of
+CPU, 18 s of wall at load 5. A grid of 256 in which no two share a fit takes 64 to 80 s of CPU (60
+to 94 s of wall at load 3, 147 s at load 9); the 36 joint configurations 18 s of CPU. XLA runs one
+program at a time on this backend, so that two threads buy nothing. No accelerator was at hand.
 """
 
 import csv

@@ -240,7 +240,8 @@ def recovery_curves(
             ax.fill_between(frame, low, high, color=colour, alpha=0.2, linewidth=0, zorder=1)
         ax.plot(
             frame, curve[:, 0], color=colour, linestyle=style, label=name, zorder=top,
-            linewidth=2.2 if is_strong else 1.1,
+            linewidth=2.2 if is_strong else 1.1, markersize=3.5, markevery=(number % 4, 4),
+            marker="os^"[number // len(CYCLE) - 1] if number >= len(CYCLE) else None,
         )  # fmt: skip
     ax.set(xlabel="frames after the jump", ylim=(-0.02, 1.02))
     ax.set_xlim(1, max((len(curve) for curve in curves.values()), default=2))

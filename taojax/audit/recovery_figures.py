@@ -114,7 +114,7 @@ def stress(runs: Sequence[Judged], rules: Rules) -> Picture:
             rows.append((run.name, drift, stretch, len(frames), share[at], median))
         labels = tuple(f"every {s}" for s in stretches)
         plots.share_grid(share, note, rows=tuple(drifts), columns=labels, ax=ax)
-        ax.set_title(run.name, fontsize=10)
+        ax.set_title(run.name.replace("alias-", "aliasing "), fontsize=10)
         ax.set_xlabel("a kidnap, frames")
     axes[0].set_ylabel("odometry drift")
     names = ("aliasing", "drift", "stretch_frames", "trials", "recovered", "median_frames")

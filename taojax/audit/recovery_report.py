@@ -30,6 +30,10 @@ def _or_never(value: float, unit: str = "") -> str:
     return "never" if np.isnan(value) else f"{plain(value)}{unit}"
 
 
+def _frames(value: float) -> str:
+    return "never" if np.isnan(value) else f"{value:.0f} frame{'s' if value > 1 else ''}"
+
+
 def _one(row: Row, event: str) -> str:
     """Say one row in a sentence."""
     if not row["trials"]:
@@ -39,8 +43,8 @@ def _one(row: Row, event: str) -> str:
     said = (
         f"{row['method']} came back within the basin in {good} of {n} {event}s"
         f" ({100 * row['recovered']:.1f} %, 95 % interval {ends} %); median"
-        f" {_or_never(row['median_frames'])} frames and {_or_never(row['median_m'], ' m')}, 95 %"
-        f" quantile {_or_never(row['p95_frames'])} frames and {_or_never(row['p95_m'], ' m')}"
+        f" {_frames(row['median_frames'])} and {_or_never(row['median_m'], ' m')}, 95 % quantile"
+        f" {_frames(row['p95_frames'])} and {_or_never(row['p95_m'], ' m')}"
     )
     if np.isnan(row["wrong_accepted_frames"]):
         return said
@@ -54,9 +58,9 @@ def _noticed(row: Row) -> str:
     if not row["trials"]:
         return ""
     return (
-        f" It refused a frame before accepting a right pose in {100 * row['noticed']:.1f} %, after"
-        f" {_or_never(row['median_notice_frames'])} frame(s) in the median, and accepted a right"
-        f" pose again after {_or_never(row['median_accepted_again_frames'])}."
+        f" It refused a frame before accepting a right pose in {100 * row['noticed']:.1f} %, in the"
+        f" median at frame {_or_never(row['median_notice_frames'])}, and accepted a right pose"
+        f" again at frame {_or_never(row['median_accepted_again_frames'])}."
     )
 
 
