@@ -250,7 +250,8 @@ def test_help_shows_an_example_and_imports_neither_jax_nor_equinox():
 def done(tmp_path_factory, source):
     folder = tmp_path_factory.mktemp("kidnap")
     write_source(folder / "data", source)
-    words = ["--trials", "4", "--rival-trials", "0", "--out", str(folder / "run"), *FLAGS]
+    words = ["--trials", "4", "--rival-trials", "0", "--association", "rank", *FLAGS]
+    words += ["--out", str(folder / "run")]
     result = command(str(folder / "data"), *words)
     assert result.returncode == 0, result.stderr
     return folder / "run", result.stdout
