@@ -11,16 +11,11 @@ import numpy as np
 from benchmarks.sets import DataSet
 from taojax import detector
 from taojax.audit import calibration, labels, sequential
-from taojax.baselines.filters import topological, virtual_place
 from taojax.baselines.frames import Frames
-from taojax.baselines.mht import mht
-from taojax.baselines.particles import ParticleParams, particles
-from taojax.baselines.sequence import seqslam, sue
-from taojax.baselines.topometric import TopometricParams, topometric
-from taojax.baselines.trajectory_prior import trajectory_prior
 from taojax.config import Config, StreamConfig
 from taojax.core.adaptive import adaptive_mean
 from taojax.runtime.maps import MapTables, map_tables
+from taojax.runtime.rivals import SYSTEMS
 from taojax.runtime.scale import LEAST_RANGE
 from taojax.runtime.score import replay_log
 from taojax.runtime.stream import Frame, StreamRecord
@@ -32,20 +27,6 @@ FUSED = "probability_map_out"
 
 GATES = ("top1", "top1_w5", "top1_w10", "top1_w20", "margin", "entropy", "velocity", "sue")
 """Columns that judge the frontend's answer and have no place of their own."""
-
-SYSTEMS: dict[str, Callable[[Frames], NamedTuple]] = {
-    "topometric": topometric,
-    "topometric, both directions": lambda f: topometric(f, TopometricParams(both_directions=True)),
-    "topological": topological,
-    "virtual place": virtual_place,
-    "particles": particles,
-    "particles, injection": lambda f: particles(f, ParticleParams(injection=True)),
-    "mht": mht,
-    "seqslam": seqslam,
-    "sue, authors' constant": sue,
-    "trajectory prior": trajectory_prior,
-}
-"""Rivals that are systems of their own, with published defaults."""
 
 UNCOMPILED = ("particles", "particles, injection", "mht", "sue, authors' constant")
 """NumPy: the first run is as fast as the second."""

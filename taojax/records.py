@@ -88,7 +88,8 @@ def digest_file(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
 
 
-def _seal(manifest: Mapping[str, Any]) -> str:
+def seal_of(manifest: Mapping[str, Any]) -> str:
+    """Return the seal that a manifest should carry: the hash of all its other entries."""
     body = {key: value for key, value in manifest.items() if key != "seal"}
     return digest(json.dumps(body, sort_keys=True).encode())
 
@@ -186,7 +187,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
         manifest = {**manifest, "tracks": list(tracks)}
     hashes = dict(manifest.get("sha256", {})) | {name: digest(raw) for name, raw in files.items()}
     sealed = {"schema": SCHEMA, **manifest, "sha256": hashes}
-    sealed["seal"] = _seal(sealed)
+    sealed["seal"] = seal_of(sealed)
     files["manifest.json"] = (json.dumps(sealed, indent=2, sort_keys=True) + "\n").encode()
     publish(out, files)
     return sealed
@@ -208,7 +209,7 @@ def read_manifest(run: Path) -> dict[str, Any]:
         raise InputError(f"{path}: is not the manifest of a run; {fix}")
     if manifest.get("schema") != SCHEMA:
         raise InputError(f"{path}: schema {manifest.get('schema')!r} is not {SCHEMA}; {fix}")
-    if manifest.get("seal") != _seal(manifest):
+    if manifest.get("seal") != seal_of(manifest):
         raise InputError(f"{path}: seal broken, the manifest was edited; {fix}")
     return manifest
 

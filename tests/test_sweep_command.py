@@ -178,11 +178,11 @@ def test_ctrl_c_reaches_the_child_and_leaves_exit_130(world, tmp_path):
     child = subprocess.Popen(
         [sys.executable, "-m", "taojax", *words_of(world, out)], stderr=subprocess.PIPE, text=True
     )
-    until = time.monotonic() + 40
+    until = time.monotonic() + 200
     while not list((out / "parts").glob("*.npz")) and time.monotonic() < until:
         time.sleep(0.05)
     os.kill(child.pid, signal.SIGINT)
-    _, err = child.communicate(timeout=30)
+    _, err = child.communicate(timeout=120)
     assert child.returncode == 130, err
     assert err.count("run the same command again to continue") == 1
     assert "Traceback" not in err

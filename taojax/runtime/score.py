@@ -94,7 +94,7 @@ def signal_table(t_s: np.ndarray, records: StreamRecord) -> dict[str, np.ndarray
     }
 
 
-def _facts(command: str, dataset: Path, seed: int) -> dict[str, Any]:
+def facts_of(command: str, dataset: Path, seed: int) -> dict[str, Any]:
     """Return what the manifest says of this machine and code."""
     package = Path(__file__).parents[1]
     sources = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
@@ -189,7 +189,7 @@ def score(
         similarity=similarity,
         config_toml=to_toml(config),
         manifest={
-            **_facts(command, dataset, config.seed),
+            **facts_of(command, dataset, config.seed),
             "notes": list(observations.notes),
             "map_recall": float(tables.recall),
             "sha256": observations.sha256,

@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from taojax.config import Config, to_toml
 from taojax.errors import InputError
-from taojax.records import SCHEMA, _seal, digest, read_manifest, refuse_if_taken
+from taojax.records import SCHEMA, digest, read_manifest, refuse_if_taken, seal_of
 from taojax.runtime import grid as grids
 from taojax.runtime.maps import map_tables
 from taojax.runtime.observations import load_observations
-from taojax.runtime.score import _facts, candidates
+from taojax.runtime.score import candidates, facts_of
 from taojax.runtime.stream import Frame
 from taojax.runtime.sweep import at_once, evaluate, plan
 from taojax.specs import table_text, write_atomically
@@ -129,7 +129,7 @@ def sweep(
         raise InputError(f"{out}: already holds a finished sweep; choose a new --out")
     observations = load_observations(dataset)
     rows = grids.expand(grid, config.stream)
-    facts = _facts(
+    facts = facts_of(
         f"taojax sweep {dataset} --config config.toml --grid grid.toml", dataset, config.seed
     )
     files: dict[str, bytes] = {
@@ -179,7 +179,7 @@ def sweep(
         "notes": list(observations.notes),
         "sha256": observations.sha256 | {name: digest(raw) for name, raw in files.items()},
     }
-    sealed["seal"] = _seal(sealed)
+    sealed["seal"] = seal_of(sealed)
     # The manifest comes last: only with it the folder counts as sealed.
     for name, raw in files.items():
         write_atomically(out / name, raw)
