@@ -99,6 +99,9 @@ def _rows(data: DataSet) -> dict[str, str]:
         with _swapped(*swap):
             rows[f"tao: {name}"] = _cell(_columns(data, StreamConfig())["tao"], field)
     rows["probability, test half: all parts"] = _test_cell(full, field, recall)
+    rows["probability, test half: prior of an unknown map"] = _test_cell(
+        full, field, calibration.LIST_RECALL
+    )
     for name in calibration.DISTINCT:
         # A constant column says nothing: the part is gone, the fit is the same.
         without = full | {name: np.zeros_like(full[name])}
