@@ -30,6 +30,10 @@ def _or_never(value: float, unit: str = "") -> str:
     return "never" if np.isnan(value) else f"{plain(value)}{unit}"
 
 
+def _way(frames: float, metres: float) -> str:
+    return "never" if np.isnan(frames) else f"{_frames(frames)} and {_or_never(metres, ' m')}"
+
+
 def _frames(value: float) -> str:
     return "never" if np.isnan(value) else f"{value:.0f} frame{'s' if value > 1 else ''}"
 
@@ -43,8 +47,8 @@ def _one(row: Row, event: str) -> str:
     said = (
         f"{row['method']} came back within the basin in {good} of {n} {event}s"
         f" ({100 * row['recovered']:.1f} %, 95 % interval {ends} %); median"
-        f" {_frames(row['median_frames'])} and {_or_never(row['median_m'], ' m')}, 95 % quantile"
-        f" {_frames(row['p95_frames'])} and {_or_never(row['p95_m'], ' m')}"
+        f" {_way(row['median_frames'], row['median_m'])}, 95 % quantile"
+        f" {_way(row['p95_frames'], row['p95_m'])}"
     )
     if np.isnan(row["wrong_accepted_frames"]):
         return said
@@ -200,7 +204,8 @@ def write_recovery(
             f"Recovered: the best pose comes within {basin_m:g} m of the truth and stays for"
             f" {rules.stay_frames} frames. Every run was scored and sealed before it was judged."
         ),
-        notes=notes,
+        # How each folder was spliced is in its manifest; the page needs to know it once.
+        notes=[note for note in notes if not note.startswith("spliced")],
         headline=words,
         cards=_cards(rows),
         grids=grids,
