@@ -175,9 +175,16 @@ def test_ctrl_c_reaches_the_child_and_leaves_exit_130(world, tmp_path):
     grid = f"association = ['rank']\nlambda_velocity = {[n / 500 for n in range(2500)]}\n"
     (tmp_path / "grid.toml").write_text(grid)
     out = tmp_path / "run"
-    child = subprocess.Popen(
-        [sys.executable, "-m", "taojax", *words_of(world, out)], stderr=subprocess.PIPE, text=True
-    )
+    # A shell that runs the tests in the background ignores interrupts, and so would the child.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "taojax", *words_of(world, out)],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
     until = time.monotonic() + 200
     while not list((out / "parts").glob("*.npz")) and time.monotonic() < until:
         time.sleep(0.05)

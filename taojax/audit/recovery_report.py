@@ -172,9 +172,9 @@ def write_recovery(
 
     if full := _loaded(parts, "offset", rules):
         rows_full = [
-            *recovery_rows(full, rules, "full offset, against the truth")[0],
+            *recovery_rows(full, rules, "full offset against the truth")[0],
             *recovery_rows(_loaded(parts, "offset", rules, seen=True), rules,
-                           "full offset, against the place seen")[0],
+                           "full offset against the place seen")[0],
         ]  # fmt: skip
         words += _offset_words(rows_full)
         table = tables.from_rows("recovery", rows_full)
