@@ -4,10 +4,11 @@ import numpy as np
 from taojax.runtime.choice import jump_evidence
 
 
-def evidence(costs, inlier):
+def evidence(costs, inlier, recall=1.0):
     costs = jnp.asarray(costs, jnp.float32)
     filled = jnp.ones(costs.shape[1], bool)
-    got = jump_evidence(costs, jnp.asarray(inlier), filled, jnp.asarray(0))
+    favourite = jnp.asarray(0)
+    got = jump_evidence(costs, jnp.asarray(inlier), filled, favourite, jnp.float32(recall))
     return np.asarray(got)
 
 
@@ -43,6 +44,17 @@ def test_frames_before_the_start_say_nothing():
     costs, inlier = rows(4)
     filled = jnp.arange(40) < 4
     got = jump_evidence(
-        jnp.asarray(costs, jnp.float32), jnp.asarray(inlier), filled, jnp.asarray(0)
+        jnp.asarray(costs, jnp.float32),
+        jnp.asarray(inlier),
+        filled,
+        jnp.asarray(0),
+        jnp.float32(1.0),
     )
     assert np.isfinite(got).all()
+
+
+def test_a_map_that_confuses_its_places_forgets_a_jump_sooner():
+    apart, alike = ([evidence(*rows(n, n=60), recall=r)[1] for n in (10, 20)] for r in (1.0, 0.5))
+    assert apart[1] > apart[0] > alike[0]
+    # Half the recall halves the evidence of a frame and the frames that count.
+    assert alike[1] < 0.5 * apart[1]

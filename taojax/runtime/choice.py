@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from taojax.core.association import JointBranch, JointParams, JointWindow, Pairing, refit
 from taojax.core.cost import squared_residuals
 
-JUMP_FRAMES = 14
-"""A jump lies at most so many frames back; by then the long memory has noticed it by itself."""
+JUMP_FRAMES = 25
+"""A jump lies at most so many frames back where a map tells all its places apart, fewer elsewhere;
+by then the long memory has noticed it by itself."""
 
 PAST_FRAMES = 15
 """Frames before a jump that tell how reliably the favourite found support."""
@@ -24,16 +25,16 @@ MOST_RELIABLE = 0.95
 LEAST_SLOPE = 0.2
 """Evidence of one unsupported frame against a favourite that rarely finds support anyway."""
 
-JUMP_EVIDENCE = 4.5
+JUMP_EVIDENCE = 4.0
 """Evidence that makes a jump where a map tells all its places apart, in nats; more elsewhere."""
 
 LOCAL_DELTAS = 3.0
 """Branches nearer than this to the reported one are the same place, known more or less exactly."""
 
-LOCAL_FRAMES = 2.0
+LOCAL_FRAMES = 1.5
 """Memory that picks the most exact of them, frames."""
 
-POSE_FRAMES = 3.0
+POSE_FRAMES = 2.0
 """Memory of the reported pose, frames: it must not lag behind where odometry drifts."""
 
 
@@ -59,6 +60,7 @@ def jump_evidence(
     is_inlier: Bool[Array, " n"],
     is_filled: Bool[Array, " n"],
     favourite: Int[Array, ""],
+    recall: Float[Array, ""],
 ) -> Float[Array, " k"]:
     """Sum what the newest frames say for every branch and against the favourite.
 
@@ -67,10 +69,12 @@ def jump_evidence(
         is_inlier: `(n,)` frames that support the favourite, newest first.
         is_filled: `(n,)` frames that exist.
         favourite: row of the branch that the whole window favours.
+        recall: how far this map tells its own places apart, from `map_recall`.
 
     Returns:
         `(k,)` nats: cost saved since the likeliest moment of a jump, in units of what an
-        unsupported frame says against a favourite that found support as often as it did before.
+        unsupported frame says against a favourite that found support as often as it did before,
+        scaled by `recall`.
     """
     n = min(JUMP_FRAMES, frame_cost.shape[1])
     saved = frame_cost[favourite][None, :n] - frame_cost[:, :n]
@@ -81,7 +85,9 @@ def jump_evidence(
     stop = jnp.minimum(start + PAST_FRAMES, total.shape[0] - 1)
     share = (good[stop] - good[start] + 1.0) / (total[stop] - total[start] + 2.0)
     slope = jnp.maximum(jnp.log(MOST_RELIABLE / (1.0 - share)), LEAST_SLOPE)
-    return jnp.max(slope[None] * jnp.cumsum(saved, axis=1), axis=1)
+    evidence = recall * slope[None] * jnp.cumsum(saved, axis=1)
+    is_recent = start.astype(recall.dtype) < JUMP_FRAMES * recall
+    return jnp.max(jnp.where(is_recent[None], evidence, -jnp.inf), axis=1)
 
 
 def _fading(age: Int[Array, " n"], is_filled: Bool[Array, " n"], frames: float) -> Array:
@@ -135,10 +141,11 @@ def report(  # noqa: PLR0913 - one argument per thing looked at
         branches.is_inlier[favourite][in_turn],
         is_filled[in_turn],
         favourite,
+        recall,
     )
     evidence = jnp.where(is_live, evidence, -jnp.inf)
     challenger = jnp.argmax(evidence)
-    is_jump = recall * evidence[challenger] > JUMP_EVIDENCE
+    is_jump = evidence[challenger] > JUMP_EVIDENCE
     chosen = jnp.where(is_jump, challenger, favourite)
 
     gap = branches.T_map_odom - branches.T_map_odom[chosen][None]
