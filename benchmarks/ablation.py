@@ -94,7 +94,10 @@ def _rows(data: DataSet) -> dict[str, str]:
     for name, settings in SETTINGS.items():
         columns = full if not settings else _columns(data, StreamConfig(**settings))
         rows[f"tao: {name}"] = _cell(columns["tao"], field)
-    rows["tao: fading window instead of adaptive memory"] = _cell(full["tao_window"], field)
+    rows["tao: without the recursive filter"] = _cell(full["tao_align"], field)
+    rows["tao: without it, fading window instead of adaptive memory"] = _cell(
+        full["tao_window"], field
+    )
     for name, swap in SWAPS.items():
         with _swapped(*swap):
             rows[f"tao: {name}"] = _cell(_columns(data, StreamConfig())["tao"], field)

@@ -20,8 +20,8 @@ from taojax.runtime.scale import LEAST_RANGE
 from taojax.runtime.score import replay_log
 from taojax.runtime.stream import Frame, StreamRecord
 
-OURS = ("tao", "tao_short", "recursive", "tao_rank")
-"""Columns of our stream that compete; one that the stream lacks is left out."""
+OURS = ("tao", "tao_align", "recursive", "tao_rank")
+"""Columns of our stream that compete."""
 
 FUSED = "probability_map_out"
 
@@ -142,7 +142,7 @@ def oracle_alignment(data: DataSet, config: StreamConfig, tables: MapTables) -> 
     """Return the joint cost at the true alignment, whatever its branches found.
 
     In every frame of the window the best anchor about the true place is taken: truncated Huber
-    cost of its distance plus 1 - similarity on the fixed scale, with the adaptive memory of `tao`.
+    cost of its distance plus 1 - similarity on the fixed scale, with the memory of `tao_align`.
     """
     n_map = len(data.map_poses)
     low, high = np.asarray(tables.scale, float)
@@ -185,7 +185,6 @@ def _ours(data: DataSet, field: Field, run: tuple[StreamRecord, MapTables, float
     found = [
         Entry(name, "ours", columns[name], None if name == "tao_rank" else place, us)
         for name in OURS
-        if name in columns
     ]
     model = calibration.fit(field.split(columns).calibration, float(run[1].recall))
     probability = detector.probability(model, columns)

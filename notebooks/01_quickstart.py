@@ -60,7 +60,7 @@ print(STATUSES[int(last.status)], np.round(np.asarray(last.pose), 2), int(last.m
 {name: round(float(last.signals[name]), 3) for name in ("top1", "tao", "recursive", "stale")}
 
 # %% [markdown]
-# `tao`, the cost of the best alignment, against the truth, which only this picture knows (grey: the
+# `tao`, cost of the best alignment and disbelief of the recursive filter, against the truth, which only this picture knows (grey: the
 # nearest map image is more than 10 m away).
 
 # %%

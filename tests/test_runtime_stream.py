@@ -1,5 +1,6 @@
 """One frame in, one record out: causal, finite, compiled once, the same in every grouping."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -312,3 +313,13 @@ def test_a_sweep_over_a_weight_is_one_vmap(rng):
 def test_map_tables_are_32_bits_wide():
     tables: MapTables = map_tables(loop(M))
     assert {leaf.dtype.itemsize for leaf in jax.tree.leaves(tables)} == {4}
+
+
+@pytest.mark.parametrize("recall", [0.0, 0.9, 1.0])
+def test_the_recursive_filter_counts_as_far_as_the_map_tells_its_places_apart(rng, recall):
+    tables, frames = log(rng)
+    tables = eqx.tree_at(lambda t: t.recall, tables, jnp.float32(recall))
+    signals = replay(SMALL, tables, frames)[1].signals
+    added = signals["tao"] - signals["tao_align"]
+    np.testing.assert_allclose(added, recall**SMALL.window * signals["recursive"], atol=1e-6)
+    assert signals["recursive"].max() > 0.01

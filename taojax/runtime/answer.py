@@ -74,21 +74,38 @@ def joint_answer(tables: MapTables, reading: JointReading) -> Answer:
 
 
 def joint_terms(
-    config: StreamConfig, delta_m: float | Array, tables: MapTables, reading: JointReading
+    config: StreamConfig,
+    delta_m: float | Array,
+    tables: MapTables,
+    reading: JointReading,
+    elsewhere: Float[Array, ""],
 ) -> dict[str, Array]:
-    """Return the columns of the joint signal, in units of the Huber threshold squared."""
+    """Return the columns of the joint signal, in units of the Huber threshold squared.
+
+    Args:
+        config: settings.
+        delta_m: Huber threshold, metres.
+        tables: the map.
+        reading: of this frame.
+        elsewhere: what the recursive filter says.
+    """
     best = reading.best
     q = tables.grid.xy[jnp.maximum(best.anchor, 0)]
     turn = jnp.concatenate([jnp.zeros(2), best.T_map_odom[2:]])
     mismatch = squared_residuals(turn, jnp.diff(reading.p, axis=0), jnp.diff(q, axis=0))
     pair = (best.is_inlier[1:] & best.is_inlier[:-1]).astype(mismatch.dtype)
     mean = jnp.sum(pair * mismatch) / jnp.maximum(jnp.sum(pair), 1.0)
+    align = adaptive_mean(best.frame_cost[::-1], reading.is_filled[::-1])
+    # A filter multiplies answers, so one confused place undoes it: it counts as much as a whole
+    # window of answers is free of confusion on this map.
     return {
-        "tao": adaptive_mean(best.frame_cost[::-1], reading.is_filled[::-1]),
+        "tao": align + tables.recall**config.window * elsewhere,
+        "tao_align": align,
         "tao_geom": best.geom,
         # A term to look at; it couples neighbours, so it is no part of the joint objective.
         "tao_vel": config.lambda_velocity * mean / delta_m**2,
         "tao_sim": best.sim,
         "tao_window": best.cost,
         "tao_rival": reading.rival,
+        "recursive": elsewhere,
     }

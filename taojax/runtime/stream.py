@@ -208,7 +208,7 @@ def step(
     if state.memory is None:
         memory = None
         terms = {name.replace("_rank", ""): value for name, value in rank_terms.items()}
-        terms |= {name: terms["tao"] for name in ("tao_window", "tao_rival")}
+        terms |= {name: terms["tao"] for name in ("tao_align", "tao_window", "tao_rival")}
         terms["recursive"] = signals.top1(similarity)
         answer = rank_answer(best, is_filled, index[rank], has_candidates)
     else:
@@ -216,7 +216,7 @@ def step(
         joint, reading = joint_step(config, tables, state.memory.joint, odometry, index, scaled)
         belief, elsewhere = recursive_step(tables, state.memory.recursive, odometry, index, scaled)
         memory = Memory(joint, belief)
-        terms = joint_terms(config, params.delta_m, tables, reading) | {"recursive": elsewhere}
+        terms = joint_terms(config, params.delta_m, tables, reading, elsewhere)
         answer = joint_answer(tables, reading)
     values = {
         "top1": signals.top1(similarity),

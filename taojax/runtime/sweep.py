@@ -24,6 +24,7 @@ from taojax.runtime.answer import joint_terms
 from taojax.runtime.grid import Row, largest
 from taojax.runtime.joint import init_joint, joint_step
 from taojax.runtime.maps import MapTables, map_tables
+from taojax.runtime.recursive import init_recursive, recursive_step
 from taojax.runtime.scale import rescale
 from taojax.runtime.stream import Frame, cost_params
 
@@ -147,17 +148,21 @@ def joint_signals(frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
     is_used &= (source >= 0) & (source < jnp.minimum(unit.branches, c))
     source = jnp.where(is_used, source, 0)
 
-    def advance(state: Any, frame: Frame) -> tuple[Any, Array]:
+    def advance(carry: Any, frame: Frame) -> tuple[Any, Array]:
+        state, belief = carry
         index = jnp.where(is_used, frame.index[source], -1)
         scaled = rescale(tables.scale, jnp.where(index >= 0, frame.similarity[source], 0.0))
         # Frames that leave the shorter window: the slot to be written next has age n.
         age = jnp.mod(state.slot - jnp.arange(n) - 1, n) + 1
         kept = eqx.tree_at(lambda s: s.is_filled, state, state.is_filled & (age < unit.window))
         state, reading = joint_step(config, tables, kept, frame.odometry, index, scaled)
+        belief, elsewhere = recursive_step(tables, belief, frame.odometry, index, scaled)
         delta_m = cost_params(config, tables).delta_m
-        return state, joint_terms(config, delta_m, tables, reading)["tao"]
+        terms = joint_terms(config, delta_m, tables, reading, elsewhere)
+        return (state, belief), terms["tao"]
 
-    start = init_joint(config, tables.grid.xy.shape[0])
+    m = tables.grid.xy.shape[0]
+    start = init_joint(config, m), init_recursive(m)
     return jax.lax.scan(advance, start, frames)[1][None]
 
 
