@@ -5,6 +5,8 @@ import sys
 import time
 from pathlib import Path
 
+from taojax.errors import TaojaxError
+
 DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where real recordings lie when `--data` does not say: beside the checkout."""
 
@@ -27,8 +29,13 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, help="folder to make (default runs/refinement/TIME)"
     )
     refinement.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
-    speed = verbs.add_parser("sweep_speed", help="a loop against vmap over configurations")
-    speed.add_argument("--out", type=Path, help="folder to make (default runs/sweep_speed/TIME)")
+    sweeps = verbs.add_parser("sweep_speed", help="a loop against vmap over configurations")
+    sweeps.add_argument("--out", type=Path, help="folder to make (default runs/sweep_speed/TIME)")
+    speed = verbs.add_parser("speed", help="step, replay, retrieval, rivals, and how they grow")
+    speed.add_argument("--quick", action="store_true", help="shorter curves, fewer repeats")
+    speed.add_argument("--out", type=Path, help="folder to make (default runs/speed/TIME)")
+    speed.add_argument("--gate", action="store_true", help="fail where a ratio got worse")
+    speed.add_argument("--bless", action="store_true", help="make this run the baseline")
     return parser
 
 
@@ -51,6 +58,14 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import sweep_speed
 
         sweep_speed.run(out)
+    elif args.verb == "speed":
+        from benchmarks import speed
+
+        try:
+            speed.run(out, quick=args.quick, gate=args.gate, blessed=args.bless)
+        except TaojaxError as error:
+            print(error, file=sys.stderr)
+            return 5
     else:
         from benchmarks import quality
 

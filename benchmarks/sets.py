@@ -1,7 +1,7 @@
 """The data sets of the leaderboard: simulated worlds, real routes, real recordings."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -12,9 +12,17 @@ import numpy as np
 from taojax.audit.truth import read_truth
 from taojax.datasets.edit import SCENARIO_SEGMENTS_M as SEGMENTS_M
 from taojax.datasets.edit import kept_by_segments, scenario
-from taojax.datasets.simulate import WorldConfig, describe_routes, make_world
+from taojax.datasets.kidnap_folder import read_poses
+from taojax.datasets.simulate import (
+    WorldConfig,
+    describe_routes,
+    make_world,
+    seen_places,
+    simulated_odometry,
+)
 from taojax.runtime.observations import load_observations
 from taojax.runtime.retrieval import normalise, retrieve, similarities
+from taojax.runtime.rivals import dense_lists
 from taojax.runtime.score import candidates
 from taojax.specs import read_table
 
@@ -125,53 +133,21 @@ def simulated(config: WorldConfig, seed: int, cut: str, *, name: str, column: st
         column: of the leaderboard.
     """
     world = scenario(make_world(config, seed), cut)
-    # Each knob has its own random stream: without the offset the same places are driven.
-    aligned = replace(config, offset_m=0.0, offset_lag_m=0.0, offset_noise_m=0.0)
     log = _Log(
         map_poses=world.map_poses[:, 1:],
         odometry=world.odometry[:, 1:],
         truth_m=world.query_poses[:, 1:3],
-        seen_m=make_world(aligned, seed).query_poses[:, 1:3],
+        seen_m=seen_places(config, seed),
     )
     descriptors = world.map_descriptors, world.query_descriptors
     return _described((name, column, "simulated"), log, descriptors, (10.0, 10.0))
 
 
-def _poses(path: Path, spec: str) -> np.ndarray:
-    table = read_table(path, spec)
-    return np.stack([table[c] for c in ("t_s", "x_m", "y_m", "theta_rad")], axis=1)
-
-
-def simulated_odometry(poses: np.ndarray, config: WorldConfig, seed: int) -> np.ndarray:
-    """Measure the motion between true poses with the noise that `config` states.
-
-    Args:
-        poses: `(T, 3)` x [m], y [m], theta [rad].
-        config: white noise per root of a driven metre, constant scale and yaw errors.
-        seed: of the noise.
-
-    Returns:
-        `(T, 3)` forward [m], left [m], yaw [rad]; row 0 is zero.
-    """
-    step, theta = np.diff(poses[:, :2], axis=0), poses[:-1, 2]
-    driven = np.hypot(step[:, 0], step[:, 1])
-    forward = np.cos(theta) * step[:, 0] + np.sin(theta) * step[:, 1]
-    left = np.cos(theta) * step[:, 1] - np.sin(theta) * step[:, 0]
-    turn = np.angle(np.exp(1j * np.diff(poses[:, 2])))
-    sd = np.array([[config.odometry_m, config.odometry_m, config.odometry_rad]])
-    noise = np.random.default_rng(seed).standard_normal((len(step), 3)) * sd
-    noise *= np.sqrt(driven)[:, None]
-    scale = 1.0 + config.odometry_scale
-    yaw = turn + config.odometry_yaw_rad_per_m * driven
-    clean = np.stack([scale * forward, scale * left, yaw], axis=1)
-    return np.concatenate([np.zeros((1, 3)), clean + noise])
-
-
 def kaist_route(folder: Path, cut: str, seed: int) -> DataSet:
     """Drive two real sessions; descriptors and odometry noise are simulated."""
     config = WorldConfig()
-    map_poses = _poses(folder / "map/poses.csv", "map_poses")
-    query = _poses(folder / "truth/query_poses.csv", "query_poses")
+    map_poses = read_poses(folder / "map/poses.csv", "map_poses")
+    query = read_poses(folder / "truth/query_poses.csv", "query_poses")
     seen = describe_routes(map_poses, query, config, seed)
     stays = kept_by_segments(map_poses[:, 1:3], SEGMENTS_M[cut])
     odometry = simulated_odometry(query[:, 1:], config, seed)
@@ -186,8 +162,8 @@ def kaist_route(folder: Path, cut: str, seed: int) -> DataSet:
 
 def robotcar_route(folder: Path, traverse: str, seed: int) -> DataSet:
     """Drive two real traverses with real visual odometry; descriptors are simulated."""
-    map_poses = _poses(folder / ROBOTCAR_MAP / "poses.csv", "map_poses")
-    query = _poses(folder / traverse / "poses.csv", "query_poses")
+    map_poses = read_poses(folder / ROBOTCAR_MAP / "poses.csv", "map_poses")
+    query = read_poses(folder / traverse / "poses.csv", "query_poses")
     table = read_table(folder / traverse / "odometry.csv", "query_odometry")
     odometry = np.stack([table[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
     log = _Log(map_poses[:, 1:], odometry, query[:, 1:3], query[:, 1:3])
@@ -205,21 +181,19 @@ def real(folder: Path, radii: tuple[float, float]) -> DataSet:
     """Load a real recording."""
     seen = load_observations(folder)
     truth = read_truth(folder / "truth", len(seen.t_s)).xy_m
-    map_poses = np.stack([seen.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    map_poses = seen.map_xyt
     names = folder.name, folder.name, "real"
     if seen.descriptors is not None:
         log = _Log(map_poses, seen.odometry, truth, truth)
         return _described(names, log, seen.descriptors, radii)
     index, similarity = candidates(seen)
-    rows = np.zeros((len(index), len(map_poses) + 1), np.float32)
-    rows[np.arange(len(index))[:, None], index] = similarity  # -1 writes into the spare column
     return DataSet(
         *names,
         map_poses,
         seen.odometry,
         index,
         similarity,
-        rows[:, :-1],
+        dense_lists(index, similarity, len(map_poses)),
         None,
         truth,
         truth,

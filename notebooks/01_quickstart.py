@@ -60,8 +60,8 @@ print(STATUSES[int(last.status)], np.round(np.asarray(last.pose), 2), int(last.m
 {name: round(float(last.signals[name]), 3) for name in ("top1", "tao", "recursive", "stale")}
 
 # %% [markdown]
-# `tao`, cost of the best alignment and disbelief of the recursive filter, against the truth, which only this picture knows (grey: the
-# nearest map image is more than 10 m away).
+# `tao`, cost of the best alignment and disbelief of the recursive filter, against the truth, which
+# only this picture knows (grey: the nearest map image is more than 10 m away).
 
 # %%
 gap = world.query_poses[:300, None, 1:3] - world.map_poses[None, :, 1:3]

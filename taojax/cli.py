@@ -8,14 +8,28 @@ import traceback
 
 import tyro
 
-from taojax.errors import ConfigError, InputError, MissingExtraError, TaojaxError, UsageError
-from taojax.verbs import audit, evaluate, kidnap, score, simulate, sweep
+from taojax.errors import (
+    ConfigError,
+    GateError,
+    InputError,
+    MissingExtraError,
+    TaojaxError,
+    UsageError,
+)
+from taojax.verbs import audit, bench, evaluate, export, kidnap, score, simulate, sweep
 from taojax.verbs.common import say
 
 ABOUT = "Am I lost, or just somewhere new, and may this loop closure enter my graph?"
-EXIT_CODES = {UsageError: 2, InputError: 3, ConfigError: 3, MissingExtraError: 4}
+EXIT_CODES = {UsageError: 2, InputError: 3, ConfigError: 3, MissingExtraError: 4, GateError: 5}
 Verb = (
-    audit.Audit | score.Score | evaluate.Evaluate | simulate.Simulate | kidnap.Kidnap | sweep.Sweep
+    audit.Audit
+    | score.Score
+    | evaluate.Evaluate
+    | simulate.Simulate
+    | kidnap.Kidnap
+    | sweep.Sweep
+    | export.Export
+    | bench.Bench
 )
 RUN = {
     audit.Audit: audit.run,
@@ -24,6 +38,8 @@ RUN = {
     simulate.Simulate: simulate.run,
     kidnap.Kidnap: kidnap.run,
     sweep.Sweep: sweep.run,
+    export.Export: export.run,
+    bench.Bench: bench.run,
 }
 
 
@@ -31,7 +47,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        0 ok, 1 internal error, 2 usage, 3 bad input, 4 missing extra, 130 interrupted.
+        0 ok, 1 internal error, 2 usage, 3 bad input, 4 missing extra, 5 slower
+        than the baseline, 130 interrupted.
     """
     args = tyro.cli(Verb, prog="taojax", args=argv, description=ABOUT)
     # Matplotlib's cache and XLA's notices are not the user's business.

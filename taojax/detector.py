@@ -18,6 +18,10 @@ from taojax.specs import column_names, read_text
 LARGEST_LOG_ODDS = 30.0
 """Keeps probabilities inside (0, 1) in float64."""
 
+LIST_RECALL = 0.75
+"""Recall of retrieval lists without map descriptors, and of a run that does not say: neither blind
+nor sure."""
+
 
 class Detector(NamedTuple):
     """Everything that `probability` needs."""

@@ -17,5 +17,9 @@ class UsageError(TaojaxError):
     """The command line asks for something that does not exist."""
 
 
+class GateError(TaojaxError):
+    """A measured figure is worse than its baseline allows."""
+
+
 class MissingExtraError(TaojaxError):
     """An optional dependency is absent; the message names the pip command."""

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from taojax.audit.calibration import accepting_level
 from taojax.audit.recovery import (
     Event,
     Outcome,
     Track,
     frames_to_recovery,
-    frozen_threshold,
     jumps_to_events,
     outcome,
     quantile,
@@ -102,11 +102,11 @@ def test_without_a_threshold_nothing_is_accepted_and_nothing_counted():
 def test_the_threshold_accepts_at_least_95_percent(rng):
     for n in (1, 2, 19, 20, 21, 100, 1000):
         values = rng.normal(size=n)
-        level = frozen_threshold(values)
+        level = accepting_level(values)
         assert (values <= level).mean() >= 0.95
         assert (values < level).mean() < 0.95
-    assert np.isnan(frozen_threshold(np.zeros(0)))
-    assert frozen_threshold(np.arange(100.0)) == 94.0
+    assert np.isnan(accepting_level(np.zeros(0)))
+    assert accepting_level(np.arange(100.0)) == 94.0
 
 
 def test_jumps_near_the_end_of_a_log_are_no_events():

@@ -144,8 +144,8 @@ def test_pooling_a_list_is_the_argmin_over_every_neighbourhood(n_listed, rng):
     row[index] = similarity
     row[-1] = 0.0
     neighbour = np.asarray(GRID.neighbour)
-    best = np.argmin(GRID.neighbour_cost + 1.0 - row[:-1][neighbour], axis=1)
-    want = neighbour[np.arange(M), best]
+    best = np.argmin(GRID.neighbour_cost + 1.0 - row[:-1][neighbour], axis=0)
+    want = neighbour[best, np.arange(M)]
     place = np.asarray(pool(GRID, 1.0, jnp.asarray(index), jnp.asarray(similarity))).astype(int)
     got = np.where(place < n_listed, np.append(index, -1)[place], np.arange(M))
     np.testing.assert_array_equal(got, want)
@@ -188,5 +188,5 @@ def test_degenerate_windows_give_finite_branches(kind):
 def test_tiny_and_coincident_maps_have_tables(n):
     for poses in (loop(n), np.zeros((n, 3))):
         tables = map_tables(poses)
-        assert tables.grid.neighbour.shape == (n, min(12, n))
+        assert tables.grid.neighbour.shape == (min(12, n), n)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tables))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import loop, motions, table
 
+from taojax.audit.recovery_data import LEAST_FRAMES
 from taojax.cli import main
 from taojax.datasets.kidnap import (
     LEVELS,
@@ -23,8 +24,8 @@ from taojax.datasets.kidnap import (
     make_logs,
     noisy_odometry,
 )
-from taojax.datasets.kidnap import motions as true_motions
 from taojax.datasets.kidnap_folder import folder_source, world_source, write_logs
+from taojax.datasets.simulate import motions as true_motions
 from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError
 from taojax.runtime.observations import load_observations
@@ -95,7 +96,7 @@ def test_a_kidnap_carries_the_robot_far_away(source, logs):
 
 
 def test_odometry_at_the_jump_is_the_step_that_belonged_to_the_frame(source, logs):
-    true = true_motions(source.query_poses)
+    true = true_motions(source.query_poses[:, 1:])
     for log in (log for log in logs if log.drift == "low"):
         rows = log.rows[log.kidnaps]
         assert (rows >= 1).all()
@@ -123,6 +124,8 @@ def test_calibration_logs_do_not_count_and_enough_others_are_made(logs):
     late = TRIAL_FRAMES - WINDOW_FRAMES
     counted = [(log.kidnaps <= late).sum() for log in low if log.split == "test"]
     assert sum(counted) >= PLAN.n_trials > sum(counted[:-1])
+    # The wall lies between: the judge has its own number for what is too near to the end.
+    assert WINDOW_FRAMES == LEAST_FRAMES
 
 
 def test_the_same_seed_gives_the_same_logs(source, logs):
@@ -232,18 +235,6 @@ def command(*words):
         [sys.executable, "-m", "taojax", "kidnap", *words],
         env=env, capture_output=True, text=True, check=False,
     )  # fmt: skip
-
-
-def test_help_shows_an_example_and_imports_neither_jax_nor_equinox():
-    code = (
-        "import sys\nfrom taojax.cli import main\n"
-        "try:\n    main(['kidnap', '--help'])\n"
-        "except SystemExit as stop:\n    assert not stop.code\n"
-        "print([m for m in sys.modules if m in ('jax', 'equinox', 'pandas', 'matplotlib')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "Example: taojax kidnap" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.fixture(scope="module")

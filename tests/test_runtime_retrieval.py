@@ -1,5 +1,6 @@
 """Retrieval is exact, bounded, and blind to the frames that come after."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -38,6 +39,37 @@ def test_a_shorter_log_gives_the_same_bits(rng):
     np.testing.assert_array_equal(long[1][:41], short[1])
 
 
+def test_a_prepared_map_gives_the_same_bits(rng):
+    places, queries = rng.normal(size=(90, 8)), rng.normal(size=(70, 8))
+    plain = retrieval.retrieve(places, queries, 20)
+    prepared = retrieval.retrieve(retrieval.prepare(places), queries, 20)
+    np.testing.assert_array_equal(plain[0], prepared[0])
+    np.testing.assert_array_equal(plain[1], prepared[1])
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_a_few_queries_of_a_prepared_map_equal_brute_force(n, rng):
+    places, queries = rng.normal(size=(90, 8)), rng.normal(size=(n, 8))
+    unit = jnp.asarray(retrieval.normalise(queries))
+    index, similarity = retrieval.top_k(retrieval.prepare(places), unit, 10)
+    want, cosine = brute_force(places, queries, 10)
+    np.testing.assert_array_equal(index, want)
+    np.testing.assert_allclose(similarity, cosine, atol=1e-6)
+
+
+def test_no_queries_find_nothing(rng):
+    index, similarity = retrieval.retrieve(rng.normal(size=(9, 4)), np.zeros((0, 4)), 5)
+    assert index.shape == similarity.shape == (0, 5)
+
+
+def test_rows_are_normalised_alone(rng, monkeypatch):
+    rows = rng.normal(size=(50, 8))
+    together = retrieval.normalise(rows)
+    monkeypatch.setattr(retrieval, "CACHE_NUMBERS", 24)
+    np.testing.assert_array_equal(retrieval.normalise(rows), together)
+    np.testing.assert_allclose(np.linalg.norm(together, axis=1), 1.0, atol=1e-6)
+
+
 def test_a_map_smaller_than_k_is_padded_with_no_candidate(rng):
     index, similarity = retrieval.retrieve(rng.normal(size=(12, 4)), rng.normal(size=(3, 4)), 100)
     assert (index[:, :12] >= 0).all()
@@ -45,7 +77,9 @@ def test_a_map_smaller_than_k_is_padded_with_no_candidate(rng):
     assert (similarity[:, 12:] == 0).all()
 
 
-def test_ties_go_to_the_lower_map_row():
+@pytest.mark.parametrize("block", [2, 4, 9])
+def test_ties_go_to_the_lower_map_row(block, monkeypatch):
+    monkeypatch.setattr(retrieval, "MAP_BLOCK", block)
     index, _ = retrieval.retrieve(np.ones((9, 3)), np.ones((2, 3)), 5)
     np.testing.assert_array_equal(index, [[0, 1, 2, 3, 4]] * 2)
 

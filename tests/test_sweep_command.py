@@ -159,18 +159,6 @@ def test_the_judge_is_never_loaded_while_scoring_and_truth_changes_no_signal(wor
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_help_shows_an_example_and_imports_no_jax():
-    code = (
-        "import sys\nfrom taojax.cli import main\n"
-        "try:\n    main(['sweep', '--help'])\n"
-        "except SystemExit as stop:\n    assert not stop.code\n"
-        "print([m for m in sys.modules if m in ('jax', 'equinox', 'pandas', 'matplotlib')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "Example: taojax sweep" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
 def test_ctrl_c_reaches_the_child_and_leaves_exit_130(world, tmp_path):
     grid = f"association = ['rank']\nlambda_velocity = {[n / 500 for n in range(2500)]}\n"
     (tmp_path / "grid.toml").write_text(grid)

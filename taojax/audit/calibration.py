@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.audit.labels import CalibrationSplit
-from taojax.detector import Detector, probability
+from taojax.detector import LIST_RECALL, Detector, probability
 
 BLURRED = {
     "top1_w5": 0.45,
@@ -32,9 +32,6 @@ DISTINCT = {
 """The same for a map that tells all its places apart: there a filter that adds up the answers of
 every frame, and a list that agrees with itself, can be believed."""
 
-LIST_RECALL = 0.75
-"""What is taken for the map's recall where a run does not say."""
-
 PRIOR_PRECISION = 10.0
 """How firmly the weights hold to the prior; one labelled effective frame weighs about 1/4."""
 
@@ -45,7 +42,7 @@ MOST_EFFECTIVE = 40.0
 """Effective frames of a class at most, so that a long standstill does not outvote the prior."""
 
 ACCEPTED_SHARE = 0.95
-"""In-map calibration frames that the detector's threshold accepts."""
+"""Share of the calibration frames that belong in the map which a frozen threshold accepts."""
 
 _TINY = 1e-9  # below it a signal is constant and says nothing
 LEAST_PER_CLASS = 5
@@ -124,11 +121,18 @@ def fit(calibration: CalibrationSplit, map_recall: float = LIST_RECALL) -> Detec
         note=_note(int(counts[0]), int(counts[1])),
     )
     inside = probability(detector, calibration.signals)[calibration.is_in]
-    return detector._replace(threshold=_accepting(inside))
+    return detector._replace(threshold=accepting_level(inside))
 
 
-def _accepting(inside: Float[np.ndarray, " n"]) -> float:
-    """Return the first level that accepts the wanted share of in-map frames; NaN without any."""
+def accepting_level(inside: Float[np.ndarray, " n"]) -> float:
+    """Return the lowest level that accepts at least 95 % of some frames.
+
+    Args:
+        inside: signal of calibration frames that should be accepted.
+
+    Returns:
+        NaN without any frame, or where the signal of one is NaN.
+    """
     if not inside.size or np.isnan(inside).any():
         return float("nan")
     return float(np.sort(inside)[int(np.ceil(ACCEPTED_SHARE * len(inside))) - 1])
@@ -151,7 +155,7 @@ def sigma_threshold(
     """
     inside = np.asarray(calibration.signals[name], dtype=float)[calibration.is_in]
     if is_probability:
-        return _accepting(inside)
+        return accepting_level(inside)
     if not inside.size or np.isnan(inside).any():
         return float("nan")
     return float(inside.mean() + sigmas * inside.std())

@@ -13,9 +13,6 @@ from jaxtyping import Bool, Float, Int
 
 from taojax.audit.labels import nearest_map_distance
 
-ACCEPTED_SHARE = 0.95
-"""Share of the right calibration frames that the frozen threshold accepts, at least."""
-
 Z_95 = 1.959964
 """Two-sided 95 % point of the normal distribution."""
 
@@ -124,21 +121,6 @@ def frames_to_recovery(right: Bool[np.ndarray, " n"], stay_frames: int) -> float
         return np.inf
     windows = np.lib.stride_tricks.sliding_window_view(right, stay_frames)
     return _first(np.asarray(windows.all(axis=1)))
-
-
-def frozen_threshold(signal: Float[np.ndarray, " n"]) -> float:
-    """Return the lowest level that accepts at least 95 % of frames with a right pose.
-
-    Args:
-        signal: of calibration frames whose pose is right.
-
-    Returns:
-        NaN without any frame.
-    """
-    ordered = np.sort(signal)
-    if not len(ordered):
-        return float("nan")
-    return float(ordered[int(np.ceil(ACCEPTED_SHARE * len(ordered) - 1e-9)) - 1])
 
 
 def outcome(

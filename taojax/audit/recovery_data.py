@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from taojax.audit.calibration import accepting_level
 from taojax.audit.recovery import (
     Event,
     Outcome,
     Track,
-    frozen_threshold,
     jumps_to_events,
     outcome,
     recovery_row,
@@ -168,7 +168,7 @@ def measure(
         track = run.tracks[method]
         chosen = run.may_fit & (run.drift == drift) & (track.error_m <= rules.basin_m)
         fitted.append(track.signal[chosen & np.isfinite(track.signal)])
-    threshold = frozen_threshold(np.concatenate([np.zeros(0), *fitted]))
+    threshold = accepting_level(np.concatenate([np.zeros(0), *fitted]))
     outcomes = [
         outcome(
             run.tracks[method], run.place_m, event, threshold,

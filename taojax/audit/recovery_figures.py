@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from taojax import plots
+from taojax.audit import recovery_plots as plots
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.recovery import quantile, recovered_within
 from taojax.audit.recovery_data import Judged, Measured, Rules, levels, measure

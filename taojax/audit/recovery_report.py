@@ -31,11 +31,9 @@ def _or_never(value: float, unit: str = "") -> str:
 
 
 def _way(frames: float, metres: float) -> str:
-    return "never" if np.isnan(frames) else f"{_frames(frames)} and {_or_never(metres, ' m')}"
-
-
-def _frames(value: float) -> str:
-    return "never" if np.isnan(value) else f"{value:.0f} frame{'s' if value > 1 else ''}"
+    if np.isnan(frames):
+        return "never"
+    return f"{frames:.0f} frame{'s' if frames > 1 else ''} and {_or_never(metres, ' m')}"
 
 
 def _one(row: Row, event: str) -> str:

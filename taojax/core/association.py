@@ -55,13 +55,13 @@ class AnchorGrid(eqx.Module):
     cell_m: Float[Array, ""]
     """Edge of a cell [m]."""
 
-    neighbour: Int[Array, "m b"]
-    """Each anchor's nearest anchors, itself first."""
+    neighbour: Int[Array, "b m"]
+    """Each anchor's nearest anchors, itself first; a row is read whole, so it lies in one piece."""
 
-    neighbour_m2: Float[Array, "m b"]
+    neighbour_m2: Float[Array, "b m"]
     """Their squared distances [m^2]."""
 
-    neighbour_cost: Float[Array, "m b"]
+    neighbour_cost: Float[Array, "b m"]
     """rho_delta of their distances over delta^2."""
 
 
@@ -166,10 +166,10 @@ def pool(
     place = jnp.full(m, c).at[listed].set(jnp.arange(c), mode="drop")
     row = jnp.append(similarity, 0.0)[place]
     # Neighbour by neighbour: an argmin over a gathered (m, b) array takes three times as long.
-    best, least = grid.neighbour[:, 0], jnp.inf
-    for b in range(grid.neighbour.shape[1]):
-        other = grid.neighbour[:, b]
-        cost = grid.neighbour_cost[:, b] + gamma * (1.0 - row[other])
+    best, least = grid.neighbour[0], jnp.inf
+    for b in range(grid.neighbour.shape[0]):
+        other = grid.neighbour[b]
+        cost = grid.neighbour_cost[b] + gamma * (1.0 - row[other])
         best = jnp.where(cost < least, other, best)
         least = jnp.minimum(cost, least)
     return place[best].astype(np.min_scalar_type(c))

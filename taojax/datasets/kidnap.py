@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from taojax.datasets.simulate import motions
 from taojax.errors import InputError
 
 __all__ = [
-    "LEVELS", "Drift", "Log", "Plan", "Source", "in_map", "make_logs", "motions", "noisy_odometry",
-    "splice",
+    "LEVELS", "Drift", "Log", "Plan", "Source", "in_map", "make_logs", "noisy_odometry", "splice",
 ]  # fmt: skip
 
 TRIAL_FRAMES = 160
@@ -110,22 +110,11 @@ class Log(NamedTuple):
     split: str
     """calibration or test."""
 
-
-def motions(poses: Float[np.ndarray, "t 4"]) -> Float[np.ndarray, "t 3"]:
-    """Return the true motion into each frame, in body axes of the frame before; row 0 is zero.
-
-    Args:
-        poses: rows (t [s], x [m], y [m], theta [rad]).
-
-    Returns:
-        Forward [m], left [m], yaw [rad] in (-pi, pi].
-    """
-    step, theta = np.diff(poses[:, 1:3], axis=0), poses[:-1, 3]
-    out = np.zeros((len(poses), 3))
-    out[1:, 0] = np.cos(theta) * step[:, 0] + np.sin(theta) * step[:, 1]
-    out[1:, 1] = np.cos(theta) * step[:, 1] - np.sin(theta) * step[:, 0]
-    out[1:, 2] = np.angle(np.exp(1j * np.diff(poses[:, 3])))
-    return out
+    @property
+    def n_counted(self) -> int:
+        """Kidnaps that count: of test logs, not in the last `WINDOW_FRAMES` frames."""
+        late = TRIAL_FRAMES - WINDOW_FRAMES
+        return int((self.kidnaps <= late).sum()) if self.split == "test" else 0
 
 
 def in_map(source: Source, r_in_m: float) -> Bool[np.ndarray, " t"]:
@@ -190,12 +179,13 @@ def _room(inside: Bool[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
 
 
 def splice(
-    source: Source, plan: Plan, rng: np.random.Generator
+    source: Source, room: Int[np.ndarray, " t"], plan: Plan, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " k"]]:
     """Draw stretches until a log is full.
 
     Args:
         source: where from.
+        room: consecutive in-map frames that begin at each frame of it.
         plan: lengths and radius.
         rng: draws lengths and places.
 
@@ -206,7 +196,6 @@ def splice(
         InputError: no stretch is long enough and far enough away.
     """
     place, least_m = source.query_poses[:, 1:3], far_m(source)
-    room = _room(in_map(source, plan.r_in_m))
     rows, jumps = np.zeros(0, int), []
     low, high = plan.stretch
     while len(rows) < TRIAL_FRAMES:
@@ -249,18 +238,18 @@ def make_logs(
         InputError: the source has too few in-map stretches.
     """
     rng = np.random.default_rng([seed, 1])
-    true_motion, unit_m = motions(source.query_poses), window_m(source)
+    true_motion, unit_m = motions(source.query_poses[:, 1:]), window_m(source)
+    room = _room(in_map(source, plan.r_in_m))
     length = np.hypot(true_motion[:, 0], true_motion[:, 1])
     logs: list[Log] = []
     n_counted, number = 0, 0
     while n_counted < plan.n_trials:
-        rows, jumps = splice(source, plan, rng)
+        rows, jumps = splice(source, room, plan, rng)
         split = "test" if number % CALIBRATION_EVERY else "calibration"
         for level in levels:
             odometry = noisy_odometry(true_motion[rows], LEVELS[level], unit_m, rng)
             middle = sum(plan.stretch) // 2
             logs.append(Log(rows, odometry, jumps, length[rows[jumps]], level, middle, split))
-        if split == "test":
-            n_counted += int((jumps <= TRIAL_FRAMES - WINDOW_FRAMES).sum())
+        n_counted += logs[-1].n_counted
         number += 1
     return logs

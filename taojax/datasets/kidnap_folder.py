@@ -1,6 +1,5 @@
 """Kidnap logs on disk: read a world or a data folder as source, write logs as a data folder."""
 
-import dataclasses
 import json
 import tomllib
 from collections.abc import Sequence
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from taojax.datasets.kidnap import LEVELS, TRIAL_FRAMES, WINDOW_FRAMES, Log, Source
-from taojax.datasets.simulate import make_world
+from taojax.datasets.simulate import make_world, seen_places
 from taojax.datasets.world import NOTE, WorldConfig
 from taojax.errors import InputError
 from taojax.specs import (
@@ -21,7 +20,7 @@ from taojax.specs import (
     write_atomically,
 )
 
-__all__ = ["folder_source", "world_source", "write_logs"]
+__all__ = ["folder_source", "read_poses", "world_source", "write_logs"]
 
 _POSE = ("t_s", "x_m", "y_m", "theta_rad")
 _ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
@@ -30,19 +29,26 @@ _ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
 def world_source(config: WorldConfig, seed: int) -> Source:
     """Simulate a world to splice from, with the place whose appearance each frame saw."""
     world = make_world(config, seed)
-    # Each knob has its own random stream: without the offset the same places are driven.
-    aligned = make_world(dataclasses.replace(config, offset_cap_m=0.0), seed)
     return Source(
         map_poses=world.map_poses,
         query_poses=world.query_poses,
-        seen_m=aligned.query_poses[:, 1:3],
+        seen_m=seen_places(config, seed),
         map_views=world.map_descriptors,
         query_views=(world.query_descriptors,),
         notes=(NOTE,),
     )
 
 
-def _poses(path: Path, spec: str) -> np.ndarray:
+def read_poses(path: Path, spec: str) -> np.ndarray:
+    """Read a table as pose rows (t [s], x [m], y [m], theta [rad]).
+
+    Args:
+        path: the table.
+        spec: its spec in data_specs/.
+
+    Raises:
+        InputError: the table is missing or malformed.
+    """
     table = read_table(path, spec)
     return np.stack([table[name] for name in _POSE], axis=1)
 
@@ -64,8 +70,8 @@ def folder_source(folder: Path) -> Source:
     Raises:
         InputError: a file is missing or malformed, or views and poses differ in number.
     """
-    map_poses = _poses(folder / "map/poses.csv", "map_poses")
-    query_poses = _poses(folder / "truth/query_poses.csv", "query_poses")
+    map_poses = read_poses(folder / "map/poses.csv", "map_poses")
+    query_poses = read_poses(folder / "truth/query_poses.csv", "query_poses")
     lists = folder / "query/retrievals.npz"
     map_views = None
     if lists.exists():

@@ -9,6 +9,8 @@ The arithmetic is element-wise in a fixed order and every result is rounded to a
 that a seed gives the same bytes on every machine under the same NumPy.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -24,7 +26,10 @@ from taojax.datasets.appearance import (
 from taojax.datasets.world import DECIMALS, World, WorldConfig, write_world
 from taojax.errors import ConfigError
 
-__all__ = ["World", "WorldConfig", "describe_routes", "make_world", "write_world"]
+__all__ = [
+    "World", "WorldConfig", "describe_routes", "make_world", "motions", "seen_places",
+    "simulated_odometry", "write_world",
+]  # fmt: skip
 
 # One random stream per purpose: turning one knob leaves all other draws as they were.
 _ROUTE, _OFFSET, _FIELD, _MAP, _QUERY, _ODOMETRY = range(6)
@@ -55,13 +60,64 @@ def make_world(config: WorldConfig, seed: int) -> World:
 
     field = appearance(_stream(seed, _FIELD), len(road_xy), config)
     query_poses = _poses(query_xy, query_arc_m / config.speed_mps)
+    odometry = simulated_odometry(query_poses[:, 1:], config, _stream(seed, _ODOMETRY))
     return World(
         map_poses=_poses(map_xy, map_arc_m / config.speed_mps),
         map_descriptors=map_view(map_rng, field, map_arc_m, config),
-        odometry=_odometry(_stream(seed, _ODOMETRY), query_poses, config),
+        odometry=_rounded(query_poses[:, 0], *odometry.T),
         query_descriptors=query_view(query_rng, field, query_arc_m, config),
         query_poses=query_poses,
     )
+
+
+def seen_places(config: WorldConfig, seed: int) -> Float[np.ndarray, "t 2"]:
+    """Return where in the map the appearance of each query frame belongs, metres.
+
+    Args:
+        config: the knobs of a world.
+        seed: its seed.
+    """
+    # Each knob has its own random stream: without the offset the same places are driven.
+    return make_world(replace(config, offset_cap_m=0.0), seed).query_poses[:, 1:3]
+
+
+def motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
+    """Return the true motion into each frame, in body axes of the frame before; row 0 is zero.
+
+    Args:
+        poses: rows (x [m], y [m], theta [rad]).
+
+    Returns:
+        Forward [m], left [m], yaw [rad] in (-pi, pi].
+    """
+    step, theta = np.diff(poses[:, :2], axis=0), poses[:-1, 2]
+    out = np.zeros((len(poses), 3))
+    out[1:, 0] = np.cos(theta) * step[:, 0] + np.sin(theta) * step[:, 1]
+    out[1:, 1] = np.cos(theta) * step[:, 1] - np.sin(theta) * step[:, 0]
+    out[1:, 2] = np.angle(np.exp(1j * np.diff(poses[:, 2])))
+    return out
+
+
+def simulated_odometry(
+    poses: Float[np.ndarray, "t 3"], config: WorldConfig, seed: int | np.random.Generator
+) -> Float[np.ndarray, "t 3"]:
+    """Measure the motion between true poses with the noise that `config` states.
+
+    Args:
+        poses: rows (x [m], y [m], theta [rad]).
+        config: white noise per root of a driven metre, constant scale and yaw errors.
+        seed: of the noise, or the generator that draws it.
+
+    Returns:
+        Forward [m], left [m], yaw [rad]; row 0 is zero.
+    """
+    out = motions(poses)
+    driven_m = lengths(out[1:, :2])
+    white = np.random.default_rng(seed).standard_normal((len(driven_m), 3)) * np.sqrt(driven_m)
+    out[1:, :2] *= 1.0 + config.odometry_scale
+    out[1:, 2:] += config.odometry_yaw_rad_per_m * driven_m
+    out[1:] += np.array([[config.odometry_m, config.odometry_m, config.odometry_rad]]) * white
+    return out
 
 
 def describe_routes(
@@ -160,22 +216,6 @@ def _poses(xy: np.ndarray, t_s: np.ndarray) -> np.ndarray:
     """Complete positions to poses that head where they drive."""
     ahead = np.concatenate([xy[1:2] - xy[:1], xy[2:] - xy[:-2], xy[-1:] - xy[-2:-1]])
     return _rounded(t_s, xy[:, 0], xy[:, 1], np.arctan2(ahead[:, 1], ahead[:, 0]))
-
-
-def _odometry(rng: np.random.Generator, poses: np.ndarray, config: WorldConfig) -> np.ndarray:
-    """Measure the motion between poses, with a constant scale and yaw error and white noise."""
-    step = np.diff(poses, axis=0)
-    cos, sin = np.cos(poses[:-1, 3]), np.sin(poses[:-1, 3])
-    driven_m = np.sqrt(step[:, 1] ** 2 + step[:, 2] ** 2)
-    white = rng.standard_normal((len(step), 3)) * np.sqrt(driven_m)[:, None]
-    scale = 1.0 + config.odometry_scale
-    forward = scale * (cos * step[:, 1] + sin * step[:, 2]) + config.odometry_m * white[:, 0]
-    left = scale * (cos * step[:, 2] - sin * step[:, 1]) + config.odometry_m * white[:, 1]
-    yaw = (step[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
-    yaw = yaw + config.odometry_yaw_rad_per_m * driven_m + config.odometry_rad * white[:, 2]
-    still = np.zeros(1)
-    motion = [np.concatenate([still, column]) for column in (forward, left, yaw)]
-    return _rounded(poses[:, 0], *motion)
 
 
 def _place_axis(

@@ -69,7 +69,7 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
     distance, nearest = tree.query(points, distance_upper_bound=reach)
     n_neighbours = min(NEIGHBOURS, len(xy))
     gap, neighbour = tree.query(xy, k=n_neighbours)
-    gap, neighbour = gap.reshape(len(xy), -1), neighbour.reshape(len(xy), -1)
+    gap, neighbour = gap.reshape(len(xy), -1).T, neighbour.reshape(len(xy), -1).T
     r = gap / delta_m
     return AnchorGrid(
         xy=jnp.asarray(xy, jnp.float32),

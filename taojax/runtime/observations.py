@@ -51,6 +51,11 @@ class Observations:
     trial_frames: int | None = None
     """The log is a row of trials of so many frames, each with a fresh start; None = one log."""
 
+    @property
+    def map_xyt(self) -> np.ndarray:
+        """(M, 3) map poses: x [m], y [m], theta [rad]."""
+        return np.stack([self.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+
 
 def _check_rows(path: Path, n_rows: int, n_wanted: int, other: Path) -> None:
     if n_rows != n_wanted:

@@ -57,10 +57,10 @@ def _spread(
     Neighbour by neighbour: summing a gathered `(2, m, b)` array takes seven times as long.
     """
     weight, spread = jnp.zeros_like(mass[0]), jnp.zeros_like(mass)
-    for b in range(grid.neighbour.shape[1]):
-        kernel = jnp.exp(-0.5 * grid.neighbour_m2[:, b] / variance)
+    for b in range(grid.neighbour.shape[0]):
+        kernel = jnp.exp(-0.5 * grid.neighbour_m2[b] / variance)
         weight = weight + kernel
-        spread = spread + kernel[None] * mass[:, grid.neighbour[:, b]]
+        spread = spread + kernel[None] * mass[:, grid.neighbour[b]]
     return spread / weight[None]
 
 

@@ -53,18 +53,22 @@ def sealed_track(records: StreamRecord, signal: str) -> SealedTrack:
     )
 
 
+def dense_lists(index: np.ndarray, similarity: np.ndarray, n_map: int) -> np.ndarray:
+    """Return `(T, M)` float32 similarity to every map row; 0 where a `(T, K)` list names none."""
+    rows = np.zeros((len(index), n_map + 1), np.float32)
+    rows[np.arange(len(index))[:, None], index] = similarity  # -1 writes into the spare column
+    return rows[:, :-1]
+
+
 def _dense(observations: Observations, frames: Frame, chosen: slice) -> np.ndarray:
-    """Return the similarity of some frames to every map row; 0 where a list names none."""
-    n_map = len(observations.map_poses["t_s"])
+    """Return the similarity of some frames to every map row."""
     if observations.descriptors is not None:
         views = (normalise(part) for part in (
             observations.descriptors[0], observations.descriptors[1][chosen]
         ))  # fmt: skip
         return np.asarray(similarities(*(jnp.asarray(view) for view in views)))
     index, similarity = np.asarray(frames.index)[chosen], np.asarray(frames.similarity)[chosen]
-    rows = np.zeros((len(index), n_map + 1), np.float32)
-    rows[np.arange(len(index))[:, None], index] = similarity  # -1 writes into the spare column
-    return rows[:, :-1]
+    return dense_lists(index, similarity, len(observations.map_poses["t_s"]))
 
 
 def rival_tracks(
@@ -87,7 +91,6 @@ def rival_tracks(
     """
     n_frames = len(observations.t_s)
     length = observations.trial_frames or n_frames
-    poses = np.stack([observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
     n_logs = min(n_frames // length, most_logs)
     tracks = {
         name: SealedTrack(
@@ -101,7 +104,7 @@ def rival_tracks(
         for log in range(n_logs):
             chosen = slice(log * length, (log + 1) * length)
             given = Frames(
-                poses,
+                observations.map_xyt,
                 np.asarray(frames.odometry)[chosen].astype(float),
                 _dense(observations, frames, chosen),
                 np.asarray(frames.index)[chosen],

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from taojax.detector import LIST_RECALL as LIST_RECALL
 from taojax.runtime.retrieval import normalise, similarities
 
 LIST_SCALE = (0.0, 1.0)
@@ -31,9 +32,6 @@ BACKGROUND_RANK = 100
 
 NEAR_SPACINGS = 9.0
 """An image within so many map spacings shows the same place."""
-
-LIST_RECALL = 0.75
-"""Recall of retrieval lists without map descriptors: neither blind nor sure."""
 
 SAMPLE = 512
 """Map images that vote on the scale, evenly spaced."""

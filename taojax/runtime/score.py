@@ -159,9 +159,8 @@ def score(
     refuse_if_taken(out)
     observations = load_observations(dataset)
     index, similarity = candidates(observations)
-    xyt = [observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")]
     known = observations.descriptors and observations.descriptors[0]
-    tables = map_tables(np.stack(xyt, axis=1), config.stream, known)
+    tables = map_tables(observations.map_xyt, config.stream, known)
     frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))
     n = observations.trial_frames
 

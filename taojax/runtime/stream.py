@@ -6,6 +6,9 @@ state, record = step(config, tables, state, frame)    # per frame
 state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
 """
 
+from collections.abc import Iterator, Mapping
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -83,6 +86,30 @@ class StreamState(eqx.Module):
     """Of the joint branches; None where `tao` is the rank cost."""
 
 
+class Signals(eqx.Module, Mapping[str, Array]):
+    """Column of data_specs/signals.toml -> value; always finite.
+
+    One array holds them all: every array that leaves a compiled call costs microseconds.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    table: Float[Array, "*t s"]
+
+    def __getitem__(self, name: str) -> Any:
+        """Return one column, `(*t)`; NumPy where the table is."""
+        if name not in self.names:
+            raise KeyError(name)
+        return self.table[..., self.names.index(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        """Go through the names."""
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        """Return the number of columns."""
+        return len(self.names)
+
+
 class StreamRecord(eqx.Module):
     """One row of the signal table."""
 
@@ -96,8 +123,7 @@ class StreamRecord(eqx.Module):
     """The robot on the best branch; zero without a pose."""
 
     has_pose: Bool[Array, "*t"]
-    signals: dict[str, Float[Array, "*t"]]
-    """Column of data_specs/signals.toml -> value; always finite."""
+    signals: Signals
 
 
 def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
@@ -252,7 +278,7 @@ def step(
         map_index=jnp.where(has_pose, answer.map_index, -1),
         pose=jnp.where(has_pose, answer.pose, 0.0),
         has_pose=has_pose,
-        signals=values,
+        signals=Signals(tuple(values), jnp.stack(list(values.values()))),
     )
     state = StreamState(
         p=p,

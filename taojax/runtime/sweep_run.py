@@ -147,7 +147,7 @@ def sweep(
     begin(out, key)
 
     index, similarity = candidates(observations)
-    poses = np.stack([observations.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    poses = observations.map_xyt
     known_views = observations.descriptors and observations.descriptors[0]
     tables = map_tables(poses, config.stream, known_views)
     frames = Frame(*(jnp.asarray(a) for a in (observations.odometry, index, similarity)))

@@ -102,7 +102,7 @@ def _splice(
     source: "Source", plans: "Sequence[Plan]", seed: int, folder: Path, rival_trials: int
 ) -> int:
     """Write the logs of some plans; return how many first logs hold the rivals' trials."""
-    from taojax.datasets.kidnap import LEVELS, TRIAL_FRAMES, WINDOW_FRAMES, make_logs
+    from taojax.datasets.kidnap import LEVELS, make_logs
     from taojax.datasets.kidnap_folder import write_logs
 
     logs = [
@@ -111,9 +111,7 @@ def _splice(
     write_logs(source, logs, folder)
     n_logs = n_counted = 0
     while n_logs < len(logs) and n_counted < rival_trials:
-        log = logs[n_logs]
-        if log.split == "test":
-            n_counted += int((log.kidnaps <= TRIAL_FRAMES - WINDOW_FRAMES).sum())
+        n_counted += logs[n_logs].n_counted
         n_logs += len(LEVELS)
     return n_logs
 
@@ -177,7 +175,6 @@ def _score_all(
     jobs: Sequence[_Job], out: Path, config: "Config", *, progress: bool
 ) -> "list[Part]":
     """Score every folder, two at a time, each in a fresh interpreter."""
-    parts = {}
 
     def score(job: _Job) -> None:
         say(f"scoring {job.name}" + (" (with rivals)" if job.rival_logs else ""))
@@ -190,6 +187,4 @@ def _score_all(
         list(pool.map(score, jobs))
     from taojax.audit.recovery_data import Part
 
-    for job in jobs:
-        parts[job.name] = Part(job.kind, job.name, out / job.name, job.data / "truth")
-    return list(parts.values())
+    return [Part(job.kind, job.name, out / job.name, job.data / "truth") for job in jobs]
