@@ -11,7 +11,7 @@ from taojax.cli import main
 from taojax.records import signal_names
 
 FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
-VERBS = ("audit", "score", "evaluate", "simulate")
+VERBS = ("audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export")
 
 
 def fails(capsys, code, *words):

@@ -4,6 +4,8 @@ A branch is one anchor per window frame. Its cost is Eq. 1 at the closed-form al
 off-map signal of a frame is the minimum over its branches (`vmap` adds them).
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -108,11 +110,56 @@ def _fit(
     lambda_velocity: float | Float[Array, ""],
 ) -> RigidFit:
     """Minimise the quadratic surrogate of Eq. 1 over the frames that have weight."""
-    is_on = weight > 0
-    pair = _normalised((is_on[1:] & is_on[:-1]).astype(p.dtype))
+    pair = pair_weights(weight > 0, p)
     # The factor 2 is the 1/2 in rho: Eq. 1 weighs |dq - R dp|^2, not half of it.
     velocity = angle_evidence(_steps(p), _steps(q), 2.0 * lambda_velocity * pair)
     return fit_se2(p, q, _normalised(weight), velocity)
+
+
+class Terms(NamedTuple):
+    """Eq. 1 at one alignment, term by term [m^2]."""
+
+    geom: Float[Array, ""]
+    vel: Float[Array, ""]
+    sim: Float[Array, ""]
+
+
+def pair_weights(is_on: Bool[Array, " n"], like: Float[Array, "n 2"]) -> Float[Array, " n-1"]:
+    """Share the velocity term among the consecutive pairs of which both frames take part."""
+    return _normalised((is_on[1:] & is_on[:-1]).astype(like.dtype))
+
+
+def cost_terms(
+    params: CostParams,
+    p: Float[Array, "n 2"],
+    branch: Branch,
+    weight: Float[Array, " n"],
+    T_map_odom: Float[Array, "3"],
+) -> Terms:
+    """Evaluate Eq. 1 at any alignment, over all frames, without residual mask.
+
+    Args:
+        params: weights and length scales.
+        p: `(n, 2)` local trajectory in time order, metres.
+        branch: one anchor per frame.
+        weight: `(n,)` weights of the window frames, summing to one.
+        T_map_odom: the alignment.
+
+    Returns:
+        The three terms; their sum is what `branch_cost` reports as `total` at its own alignment.
+    """
+    q = jnp.where(branch.has_anchor[:, None], branch.q, 0.0)
+    rho = huber(squared_residuals(T_map_odom, p, q), params.delta_m)
+    rho = jnp.where(branch.has_anchor, rho, params.tau_missing)
+    pair = pair_weights(branch.has_anchor & (weight > 0), p)
+    turn_only = jnp.concatenate([jnp.zeros(2, p.dtype), T_map_odom[2:]])
+    mismatch = squared_residuals(turn_only, _steps(p), _steps(q))
+    similarity = jnp.where(branch.has_anchor, branch.similarity, 0.0)
+    return Terms(
+        geom=jnp.sum(weight * rho),
+        vel=params.lambda_velocity * jnp.sum(pair * mismatch),
+        sim=params.gamma_similarity * jnp.sum(weight * (1.0 - similarity)),
+    )
 
 
 def branch_cost(
@@ -150,19 +197,13 @@ def branch_cost(
     T_map_odom = jnp.where(keep_first, first.T_map_odom, second.T_map_odom)
     is_degenerate = first.is_degenerate | (jnp.sum(supported > 0) < MIN_PAIRS)
 
-    squared = squared_residuals(T_map_odom, p, q)
-    rho = jnp.where(branch.has_anchor, huber(squared, params.delta_m), params.tau_missing)
-    is_on = supported > 0
-    pair = _normalised((is_on[1:] & is_on[:-1]).astype(p.dtype))
-    no_shift = jnp.zeros(2, p.dtype)
-    turn_only = jnp.concatenate([no_shift, T_map_odom[2:]])
-    mismatch = squared_residuals(turn_only, _steps(p), _steps(q))
-    similarity = jnp.where(branch.has_anchor, branch.similarity, 0.0)
+    terms = cost_terms(params, p, branch, weight, T_map_odom)
+    is_near = squared_residuals(T_map_odom, p, q) <= params.mask_m**2
     return BranchCost(
-        geom=jnp.sum(weight * rho),
-        vel=params.lambda_velocity * jnp.sum(pair * mismatch),
-        sim=params.gamma_similarity * jnp.sum(weight * (1.0 - similarity)),
+        geom=terms.geom,
+        vel=terms.vel,
+        sim=terms.sim,
         T_map_odom=T_map_odom,
-        is_inlier=is_on & (squared <= params.mask_m**2),
+        is_inlier=(supported > 0) & is_near,
         is_degenerate=is_degenerate,
     )

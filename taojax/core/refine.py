@@ -14,9 +14,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from taojax.core.cost import MIN_PAIRS, Branch, CostParams, huber, squared_residuals
+from taojax.core.cost import (
+    MIN_PAIRS,
+    Branch,
+    CostParams,
+    cost_terms,
+    pair_weights,
+    squared_residuals,
+)
 from taojax.core.procrustes import angle_evidence, fit_se2, weighted_mean
 from taojax.core.se2 import rotate, wrap
 
@@ -51,45 +58,6 @@ class Refinement(eqx.Module):
     """Closed-form solutions computed."""
 
 
-def _pair_weights(is_on: Bool[Array, " n"], like: Float[Array, "n 2"]) -> Float[Array, " n-1"]:
-    """Share the velocity term among the consecutive pairs of which both frames take part."""
-    pair = (is_on[1:] & is_on[:-1]).astype(like.dtype)
-    return pair / jnp.maximum(jnp.sum(pair), 1.0)
-
-
-def cost_at(
-    params: CostParams,
-    p: Float[Array, "n 2"],
-    branch: Branch,
-    weight: Float[Array, " n"],
-    T_map_odom: Float[Array, "3"],
-) -> Float[Array, ""]:
-    """Evaluate Eq. 1 at any alignment, over all frames, without residual mask [m^2].
-
-    Args:
-        params: weights and length scales.
-        p: `(n, 2)` local trajectory in time order, metres.
-        branch: one anchor per frame.
-        weight: `(n,)` weights of the window frames, summing to one.
-        T_map_odom: the alignment.
-
-    Returns:
-        The number that `branch_cost` reports as `total` at its own alignment.
-    """
-    q = jnp.where(branch.has_anchor[:, None], branch.q, 0.0)
-    rho = huber(squared_residuals(T_map_odom, p, q), params.delta_m)
-    geom = jnp.sum(weight * jnp.where(branch.has_anchor, rho, params.tau_missing))
-    pair = _pair_weights(branch.has_anchor & (weight > 0), p)
-    turn_only = jnp.concatenate([jnp.zeros(2, p.dtype), T_map_odom[2:]])
-    mismatch = squared_residuals(turn_only, p[1:] - p[:-1], q[1:] - q[:-1])
-    similarity = jnp.where(branch.has_anchor, branch.similarity, 0.0)
-    return (
-        geom
-        + params.lambda_velocity * jnp.sum(pair * mismatch)
-        + params.gamma_similarity * jnp.sum(weight * (1.0 - similarity))
-    )
-
-
 def _solve(
     params: CostParams,
     p: Float[Array, "n 2"],
@@ -113,7 +81,7 @@ def _solve(
     gap = jnp.where(is_on[:, None], branch.q - target[None, :], 0.0) / unit_m
     y = rotate(jnp.broadcast_to(-start[2], is_on.shape), gap)
     delta = params.delta_m / unit_m
-    pair = 2.0 * params.lambda_velocity * _pair_weights(is_on, p)
+    pair = 2.0 * params.lambda_velocity * pair_weights(is_on, p)
     velocity = angle_evidence(x[1:] - x[:-1], y[1:] - y[:-1], pair)
 
     def again(pose: Float[Array, "3"], _: None) -> Float[Array, "3"]:
@@ -164,7 +132,7 @@ def refine(
     Source:
         Huber, Robust Statistics, 1981, section 7.8 (modified weights never raise the objective).
     """
-    is_finite = jnp.isfinite(cost_at(params, p, branch, weight, start))
+    is_finite = jnp.isfinite(sum(cost_terms(params, p, branch, weight, start)))
     # Harmless numbers in place of bad ones: NaN times zero is NaN, and so is its gradient.
     p, weight, start = (jnp.where(is_finite, a, 0.0) for a in (p, weight, start))
     q, similarity = (jnp.where(is_finite, a, 0.0) for a in (branch.q, branch.similarity))
@@ -177,8 +145,8 @@ def refine(
     pose, status, n_steps = _solve(*problem)
     start = jax.lax.stop_gradient(start)
     pose = pose.astype(start.dtype)
-    start_cost = cost_at(params, p, branch, weight, start)
-    cost = cost_at(params, p, branch, weight, pose)
+    start_cost = sum(cost_terms(params, p, branch, weight, start))
+    cost = sum(cost_terms(params, p, branch, weight, pose))
     is_better = (cost < start_cost) & (status != DEGENERATE)
     return Refinement(
         T_map_odom=jnp.where(is_better, pose, start),

@@ -9,6 +9,7 @@ from taojax.config import StreamConfig
 from taojax.core.adaptive import adaptive_mean
 from taojax.core.association import look_up
 from taojax.core.cost import BranchCost, squared_residuals
+from taojax.runtime.choice import since_support
 from taojax.runtime.joint import JointReading
 from taojax.runtime.maps import MapTables
 
@@ -33,12 +34,6 @@ class Answer(NamedTuple):
     """There is a hypothesis at all."""
 
 
-def _since(is_inlier: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Return the frames before the first inlier, newest first; their number without any."""
-    n = is_inlier.shape[0]
-    return jnp.where(jnp.any(is_inlier), jnp.argmax(is_inlier), n).astype(jnp.float32)
-
-
 def rank_answer(
     best: BranchCost, is_filled: Array, map_index: Array, has_candidates: Array
 ) -> Answer:
@@ -48,7 +43,7 @@ def rank_answer(
         pose=best.T_map_odom,
         map_index=map_index,
         share=jnp.sum(best.is_inlier.astype(best.geom.dtype)) / n_filled,
-        stale=_since(best.is_inlier[::-1]),
+        stale=since_support(best.is_inlier[::-1]),
         is_lost=jnp.zeros((), bool),  # the literal cost knows no jumps
         is_degenerate=best.is_degenerate,
         is_known=has_candidates,

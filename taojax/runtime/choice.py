@@ -90,6 +90,12 @@ def jump_evidence(
     return jnp.max(jnp.where(is_recent[None], evidence, -jnp.inf), axis=1)
 
 
+def since_support(is_inlier: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Return the frames before the first inlier, newest first; their number without any."""
+    n = is_inlier.shape[0]
+    return jnp.where(jnp.any(is_inlier), jnp.argmax(is_inlier), n).astype(jnp.float32)
+
+
 def _fading(age: Int[Array, " n"], is_filled: Bool[Array, " n"], frames: float) -> Array:
     weight = jnp.where(is_filled, jnp.exp(-age.astype(jnp.float32) / frames), 0.0)
     return weight / jnp.sum(weight)
@@ -164,6 +170,6 @@ def report(  # noqa: PLR0913 - one argument per thing looked at
         pose=now(exact),
         anchor=jnp.where(inlier[0], branches.anchor[exact][in_turn[0]], -1),
         is_jump=is_jump,
-        stale=jnp.where(jnp.any(inlier), jnp.argmax(inlier), n).astype(jnp.float32),
+        stale=since_support(inlier),
         challenger=now(challenger),
     )

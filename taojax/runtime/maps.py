@@ -8,7 +8,8 @@ from scipy.spatial import KDTree
 
 from taojax.config import StreamConfig
 from taojax.core.association import AnchorGrid
-from taojax.runtime.scale import LIST_RECALL, LIST_SCALE, MapView, view_map
+from taojax.detector import LIST_RECALL
+from taojax.runtime.scale import LIST_SCALE, MapView, view_map
 
 NEIGHBOURS = 12
 """Anchors pooled around each anchor."""

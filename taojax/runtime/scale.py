@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from taojax.detector import LIST_RECALL as LIST_RECALL
 from taojax.runtime.retrieval import normalise, similarities
 
 LIST_SCALE = (0.0, 1.0)
