@@ -45,7 +45,9 @@ def _costs(xp: Any, params: CostParams, p: Any, q: Any, similarity: Any, has: An
     r, t = _rigid(xp, p, q, weight, pair, params.lambda_velocity)
     near = has & (_squared(xp, p, q, r, t) <= params.mask_m**2)
     near_pair = (near[:, 1:] & near[:, :-1]).astype(p.dtype)
-    r_near, t_near = _rigid(xp, p, q, weight * near.astype(p.dtype), near_pair, params.lambda_velocity)
+    r_near, t_near = _rigid(
+        xp, p, q, weight * near.astype(p.dtype), near_pair, params.lambda_velocity
+    )
     is_few = near.sum(1) < MIN_PAIRS
     r = xp.where(is_few[:, None, None], r, r_near)
     t = xp.where(is_few[:, None], t, t_near)

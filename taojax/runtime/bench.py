@@ -186,7 +186,10 @@ def retrieval(n_places: int, width: int, repeats: int) -> list[Row]:
     query = rng.standard_normal((1, width)).astype(np.float32)
     places, unit = prepare(descriptors), jnp.asarray(normalise(query))
     total = jax.jit(jnp.sum)
-    read = best_us(lambda: total(places.rows), repeats)
+    # Whichever reads faster: neither always saturates the memory.
+    read = min(
+        best_us(lambda: total(places.rows), repeats), best_us(lambda: descriptors.sum(), repeats)
+    )
     ours = best_us(lambda: top_k(places, unit, K), repeats)
     rows = [
         Row("retrieval_us", ours, "us"),
