@@ -11,10 +11,12 @@ What limits the speed on a CPU (2 cores, XLA of jaxlib 0.10, one run; ratios in 
 What did not help: one thread instead of two, no asynchronous dispatch, donated state, state packed
 into one array, the step inside a loop of one turn, tuned malloc thresholds; for the literal cost
 sums over the leading axis and unrolled sums. Moments by matrix products instead of sums took it
-from 100 to 73 us alone; not taken, it is a twentieth of a joint step. What did: one array for all signals, coordinates gathered one by
-one, lists and bytes in the rings, map and settings closed over instead of handed in, and no more
-than 2,000 branch-frames of the literal cost under one vmap (beyond, XLA's sums get slower by a
-jump: 300 branches 1,430 -> 520 us, a window of 50 1,180 -> 410 us).
+from 100 to 73 us alone; not taken, it is a twentieth of a joint step.
+
+What did: one array for all signals, coordinates gathered one by one, lists and bytes in the rings,
+map and settings closed over instead of handed in, and no more than 2,000 branch-frames of the
+literal cost under one vmap (beyond, XLA's sums get slower by a jump: 300 branches 1,430 -> 520 us,
+a window of 50 frames 1,180 -> 410 us).
 """
 
 import csv
