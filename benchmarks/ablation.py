@@ -20,6 +20,7 @@ from taojax.audit import calibration, metrics
 from taojax.config import AuditConfig, Config, StreamConfig
 from taojax.core import association
 from taojax.runtime import joint
+from taojax.runtime.maps import map_tables
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "all ingredients": {},

@@ -136,14 +136,15 @@ def over_tree(drive: bench.Drive, n_frames: int) -> dict[str, Curve]:
         drive.index[:n_frames], drive.similarity[:n_frames],
     )  # fmt: skip
     forms = {"mht bounded": MhtParams(), "mht unbounded": MhtParams(width=None, n_scan=None)}
-    curves = {
+    curves: dict[str, Curve] = {
         f"{name} hypotheses over t": [
             (t + 1, float(n)) for t, n in enumerate(mht(frames, params).n_hypotheses)
         ]
         for name, params in forms.items()
     }
-    ours = 2 * StreamConfig().joint_seeds + 2
-    return curves | {"tao hypotheses over t": [(t + 1, float(ours)) for t in range(n_frames)]}
+    ours = float(2 * StreamConfig().joint_seeds + 2)
+    curves["tao hypotheses over t"] = [(t + 1, ours) for t in range(n_frames)]
+    return curves
 
 
 def exponent(curve: Curve) -> float:
