@@ -168,7 +168,7 @@ def draw(curves: dict[str, Curve]) -> Figure:
             ax.loglog(*np.array(curve).T, marker="o", markersize=3, linewidth=1.2, label=text)
         ax.set(xlabel=label, ylabel="hypotheses" if panel == "over t" else "us per frame")
         ax.grid(visible=True, which="major", linewidth=0.4)
-        ax.set_ylim(bottom=1.0)
+        ax.set_ylim(1.0, 4.0 * ax.get_ylim()[1])
         ax.legend(fontsize=7)
     return figure
 
