@@ -20,7 +20,6 @@ a window of 50 frames 1,180 -> 410 us).
 """
 
 import csv
-import resource
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,7 +29,6 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from taojax.baselines.frames import Frames
 from taojax.baselines.mht import MhtParams, mht
 from taojax.config import StreamConfig
 from taojax.runtime import bench
@@ -117,9 +115,8 @@ def over_time(drive: bench.Drive, most: int) -> dict[str, Curve]:
         config = StreamConfig(association=association)
         for length in (t for t in (1000, 10_000, 100_000, 1_000_000) if t <= limit):
             took = _streamed(config, drive, length)
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
             found.setdefault(f"{association} over T", []).append((length, took))
-            found.setdefault(f"{association} memory over T", []).append((length, peak))
+            found.setdefault(f"{association} memory over T", []).append((length, bench.peak_mb()))
     return found
 
 
@@ -131,10 +128,7 @@ def over_map(most: int, repeats: int) -> dict[str, Curve]:
 
 def over_tree(drive: bench.Drive, n_frames: int) -> dict[str, Curve]:
     """Return hypotheses per frame of multi-hypothesis tracking; ours stay 2 seeds + 2."""
-    frames = Frames(
-        drive.map_poses, drive.odometry[:n_frames].astype(float), drive.rows[:n_frames],
-        drive.index[:n_frames], drive.similarity[:n_frames],
-    )  # fmt: skip
+    frames = drive.first(n_frames)
     forms = {"mht bounded": MhtParams(), "mht unbounded": MhtParams(width=None, n_scan=None)}
     curves: dict[str, Curve] = {
         f"{name} hypotheses over t": [

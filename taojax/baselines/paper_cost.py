@@ -14,13 +14,19 @@ from jaxtyping import Array, Bool, Float
 from taojax.core.cost import MIN_PAIRS, CostParams
 
 
-def _rigid(xp: Any, p: Any, q: Any, weight: Any, pair: Any, lambda_velocity: Any) -> Any:
+def _pairs(has: Any, like: Any) -> Any:
+    """Return 1 for every pair of consecutive frames that both take part."""
+    return (has[:, 1:] & has[:, :-1]).astype(like.dtype)
+
+
+def _rigid(  # noqa: PLR0913 - steps are handed in, so that they are taken once
+    xp: Any, p: Any, q: Any, dp: Any, dq: Any, weight: Any, pair: Any, lambda_velocity: Any
+) -> Any:
     """Return rotations `(k, 2, 2)` and shifts `(k, 2)` of K weighted alignments."""
     total, n_pairs = weight.sum(1, keepdims=True), pair.sum(1, keepdims=True)
     share = weight / xp.where(total > 0, total, 1.0)
     p_mean, q_mean = share @ p, xp.einsum("kn,knd->kd", share, q)
     x, y = p[None] - p_mean[:, None], q - q_mean[:, None]
-    dp, dq = p[1:] - p[:-1], q[:, 1:] - q[:, :-1]
     tied = 2.0 * lambda_velocity * pair / xp.where(n_pairs > 0, n_pairs, 1.0)
     # Two factors each: an einsum over weights, x and y at once takes twice as long.
     h = xp.einsum("kni,knj->kij", share[..., None] * x, y)
@@ -41,13 +47,12 @@ def _costs(xp: Any, params: CostParams, p: Any, q: Any, similarity: Any, has: An
     n = p.shape[0]
     weight = xp.where(has, xp.asarray(1.0 / n, p.dtype), xp.zeros((), p.dtype))
     q = xp.where(has[..., None], q, xp.zeros((), p.dtype))
-    pair = (has[:, 1:] & has[:, :-1]).astype(p.dtype)
-    r, t = _rigid(xp, p, q, weight, pair, params.lambda_velocity)
+    dp, dq = p[1:] - p[:-1], q[:, 1:] - q[:, :-1]
+    pair, lambda_velocity = _pairs(has, p), params.lambda_velocity
+    r, t = _rigid(xp, p, q, dp, dq, weight, pair, lambda_velocity)
     near = has & (_squared(xp, p, q, r, t) <= params.mask_m**2)
-    near_pair = (near[:, 1:] & near[:, :-1]).astype(p.dtype)
-    r_near, t_near = _rigid(
-        xp, p, q, weight * near.astype(p.dtype), near_pair, params.lambda_velocity
-    )
+    near_weight = weight * near.astype(p.dtype)
+    r_near, t_near = _rigid(xp, p, q, dp, dq, near_weight, _pairs(near, p), lambda_velocity)
     is_few = near.sum(1) < MIN_PAIRS
     r = xp.where(is_few[:, None, None], r, r_near)
     t = xp.where(is_few[:, None], t, t_near)
@@ -56,11 +61,11 @@ def _costs(xp: Any, params: CostParams, p: Any, q: Any, similarity: Any, has: An
     linear = params.delta_m * (root - 0.5 * params.delta_m)
     rho = xp.where(root <= params.delta_m, 0.5 * squared, linear)
     geom = xp.where(has, rho, params.tau_missing).mean(1)
-    turned = _squared(xp, p[1:] - p[:-1], q[:, 1:] - q[:, :-1], r, xp.zeros_like(t))
+    turned = _squared(xp, dp, dq, r, xp.zeros_like(t))
     n_pairs = pair.sum(1)
     vel = (pair * turned).sum(1) / xp.where(n_pairs > 0, n_pairs, 1.0)
     sim = 1.0 - xp.where(has, similarity, xp.zeros((), p.dtype)).mean(1)
-    return geom + params.lambda_velocity * vel + params.gamma_similarity * sim
+    return geom + lambda_velocity * vel + params.gamma_similarity * sim
 
 
 def numpy_cost(

@@ -78,6 +78,16 @@ class Drive:
     rows: np.ndarray
     """(T, M) similarity to every map image."""
 
+    def first(self, n_frames: int) -> Frames:
+        """Return the first frames as the rivals take them."""
+        return Frames(
+            self.map_poses,
+            self.odometry[:n_frames].astype(float),
+            self.rows[:n_frames],
+            self.index[:n_frames],
+            self.similarity[:n_frames],
+        )
+
 
 def best_us(work: Callable[[], object], repeats: int, per: int = 1) -> float:
     """Return the microseconds of the fastest repeat, divided by `per`; the first call is free."""
@@ -88,6 +98,13 @@ def best_us(work: Callable[[], object], repeats: int, per: int = 1) -> float:
         jax.block_until_ready(work())
         best = min(best, time.perf_counter() - began)
     return best / per * 1e6
+
+
+def peak_mb() -> float:
+    """Return the most memory that this process ever held."""
+    # Kilobytes on Linux, bytes on macOS.
+    unit = 1.0 if sys.platform == "darwin" else 1e3
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def random_windows(rng: np.random.Generator, k: int, n: int) -> tuple[np.ndarray, ...]:
@@ -142,7 +159,7 @@ def _stream(drive: Drive, association: str, *, n_calls: int, repeats: int) -> li
         for q in (50, 95, 99)
     ]
     whole = best_us(lambda: replay(config, tables, frames), repeats, len(single))
-    held = sum(leaf.nbytes for leaf in jax.tree.leaves(init(config, tables)))
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     return [
         *rows,
         Row(f"replay_{association}_us", whole, "us"),
@@ -152,12 +169,7 @@ def _stream(drive: Drive, association: str, *, n_calls: int, repeats: int) -> li
 
 def _rivals(drive: Drive, n_frames: int) -> list[Row]:
     """Time systems of their own on the same frames; us per frame."""
-
-    def given(n: int) -> Frames:
-        return Frames(drive.map_poses, drive.odometry[:n].astype(float), drive.rows[:n],
-                      drive.index[:n], drive.similarity[:n])  # fmt: skip
-
-    frames, few = given(n_frames), given(min(n_frames, 60))
+    frames, few = drive.first(n_frames), drive.first(min(n_frames, 60))
     unbounded = MhtParams(width=None, n_scan=None)
     return [
         Row("topometric_us", best_us(lambda: topometric(frames), 2, n_frames), "us"),
@@ -261,10 +273,7 @@ def measure(drive: Drive, *, quick: bool, say: Callable[[str], None]) -> list[Ro
     if not quick:
         say("first step in a fresh interpreter")
         rows += _first_steps()
-    # Kilobytes on Linux, bytes on macOS.
-    unit = 1.0 if sys.platform == "darwin" else 1e3
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-    return [*rows, Row("peak_memory_mb", peak, "MB")]
+    return [*rows, Row("peak_memory_mb", peak_mb(), "MB")]
 
 
 def write_rows(rows: Sequence[Row], path: Path) -> None:

@@ -26,7 +26,7 @@ from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
 from taojax.runtime import signals
 from taojax.runtime.answer import joint_answer, joint_terms, rank_answer
-from taojax.runtime.joint import JointState, init_joint, joint_step
+from taojax.runtime.joint import JointReading, JointState, init_joint, joint_step
 from taojax.runtime.maps import MapTables
 from taojax.runtime.recursive import RecursiveState, init_recursive, recursive_step
 from taojax.runtime.scale import rescale
@@ -154,13 +154,31 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
         is_filled=jnp.zeros(n, bool),
         top1=jnp.zeros(max(signals.WINDOWS)),
         n_seen=jnp.zeros((), jnp.int32),
-        memory=None if config.association == "rank" else _init_memory(config, tables),
+        memory=None if config.association == "rank" else init_memory(config, tables),
     )
 
 
-def _init_memory(config: StreamConfig, tables: MapTables) -> Memory:
+def init_memory(config: StreamConfig, tables: MapTables) -> Memory:
+    """Return what joint association remembers before the first frame."""
     m = tables.grid.xy.shape[0]
     return Memory(init_joint(config, m), init_recursive(m))
+
+
+def memory_step(
+    config: StreamConfig,
+    tables: MapTables,
+    memory: Memory,
+    odometry: Float[Array, "3"],
+    index: Int[Array, " c"],
+    similarity: Float[Array, " c"],
+) -> tuple[Memory, JointReading, dict[str, Array]]:
+    """Advance joint branches and recursive filter by one clean frame; return their columns too."""
+    scaled = rescale(tables.scale, similarity)
+    joint, reading = joint_step(config, tables, memory.joint, odometry, index, scaled)
+    belief, elsewhere = recursive_step(tables, memory.recursive, odometry, index, scaled)
+    delta_m = cost_params(config, tables).delta_m
+    terms = joint_terms(config, delta_m, tables, reading, elsewhere)
+    return Memory(joint, belief), reading, terms
 
 
 def _push(window: Array, newest: Array) -> Array:
@@ -254,11 +272,9 @@ def step(
         terms["recursive"] = signals.top1(similarity)
         answer = rank_answer(best, is_filled, index[rank], has_candidates)
     else:
-        scaled = rescale(tables.scale, similarity)
-        joint, reading = joint_step(config, tables, state.memory.joint, odometry, index, scaled)
-        belief, elsewhere = recursive_step(tables, state.memory.recursive, odometry, index, scaled)
-        memory = Memory(joint, belief)
-        terms = joint_terms(config, params.delta_m, tables, reading, elsewhere)
+        memory, reading, terms = memory_step(
+            config, tables, state.memory, odometry, index, similarity
+        )
         answer = joint_answer(tables, reading)
     values = {
         "top1": signals.top1(similarity),

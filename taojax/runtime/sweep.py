@@ -20,13 +20,9 @@ from jaxtyping import Array, Bool, Float, Int
 from taojax.config import StreamConfig
 from taojax.core.cost import Branch, branch_cost
 from taojax.core.se2 import inverse, transform
-from taojax.runtime.answer import joint_terms
 from taojax.runtime.grid import Row, largest
-from taojax.runtime.joint import init_joint, joint_step
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.recursive import init_recursive, recursive_step
-from taojax.runtime.scale import rescale
-from taojax.runtime.stream import Frame, cost_params
+from taojax.runtime.stream import Frame, Memory, cost_params, init_memory, memory_step
 
 MOST_AT_ONCE = 32
 """Units under one `vmap` at most, where vmap is used at all."""
@@ -148,22 +144,18 @@ def joint_signals(frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
     is_used &= (source >= 0) & (source < jnp.minimum(unit.branches, c))
     source = jnp.where(is_used, source, 0)
 
-    def advance(carry: Any, frame: Frame) -> tuple[Any, Array]:
-        state, belief = carry
+    def advance(memory: Memory, frame: Frame) -> tuple[Memory, Array]:
+        state = memory.joint
         index = jnp.where(is_used, frame.index[source], -1)
-        scaled = rescale(tables.scale, jnp.where(index >= 0, frame.similarity[source], 0.0))
+        similarity = jnp.where(index >= 0, frame.similarity[source], 0.0)
         # Frames that leave the shorter window: the slot to be written next has age n.
         age = jnp.mod(state.slot - jnp.arange(n) - 1, n) + 1
-        kept = eqx.tree_at(lambda s: s.is_filled, state, state.is_filled & (age < unit.window))
-        state, reading = joint_step(config, tables, kept, frame.odometry, index, scaled)
-        belief, elsewhere = recursive_step(tables, belief, frame.odometry, index, scaled)
-        delta_m = cost_params(config, tables).delta_m
-        terms = joint_terms(config, delta_m, tables, reading, elsewhere)
-        return (state, belief), terms["tao"]
+        is_filled = state.is_filled & (age < unit.window)
+        kept = eqx.tree_at(lambda m: m.joint.is_filled, memory, is_filled)
+        memory, _, terms = memory_step(config, tables, kept, frame.odometry, index, similarity)
+        return memory, terms["tao"]
 
-    m = tables.grid.xy.shape[0]
-    start = init_joint(config, m), init_recursive(m)
-    return jax.lax.scan(advance, start, frames)[1][None]
+    return jax.lax.scan(advance, init_memory(config, tables), frames)[1][None]
 
 
 def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:

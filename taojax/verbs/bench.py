@@ -1,6 +1,7 @@
 """`taojax bench`: how fast this machine is, rivals beside."""
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,15 +30,14 @@ class Bench:
 
 
 def simulated_drive(n_frames: int) -> "Drive":
-    """Return the first frames of the simulated default scenario."""
+    """Return the first frames of the simulated world, no segment of its map deleted."""
     import numpy as np
 
-    from taojax.datasets.edit import scenario
     from taojax.datasets.simulate import WorldConfig, make_world
     from taojax.runtime.bench import Drive
     from taojax.runtime.retrieval import normalise, retrieve
 
-    world = scenario(make_world(WorldConfig(), 0), "full")
+    world = make_world(WorldConfig(), 0)
     queries = world.query_descriptors[:n_frames]
     index, similarity = retrieve(world.map_descriptors, queries)
     return Drive(
@@ -52,8 +52,6 @@ def simulated_drive(n_frames: int) -> "Drive":
 
 def run(args: Bench) -> None:
     """Measure, write, and hold against a baseline."""
-    import time
-
     from taojax.runtime import bench
 
     out = args.out or Path("runs") / "bench" / time.strftime("%Y%m%d-%H%M%S")
