@@ -24,7 +24,7 @@ from taojax.runtime.observations import load_observations
 from taojax.runtime.retrieval import normalise, retrieve, similarities
 from taojax.runtime.rivals import dense_lists
 from taojax.runtime.score import candidates
-from taojax.specs import read_table
+from taojax.tables import read_table
 
 REAL = {"mit_corridor": (5.0, 10.0), "intel_lab": (1.5, 3.0), "tuc_corridor_mapout": (2.0, 4.0)}
 """Real recordings -> r_in, r_out [m]."""

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taojax.errors import InputError
-from taojax.specs import load_spec, read_bytes, read_npz, read_table, table_text, write_atomically
+from taojax.specs import load_spec, read_bytes, read_npz, write_atomically
+from taojax.tables import read_table, table_text
 
 SCHEMA = 1
 SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")

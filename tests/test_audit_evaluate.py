@@ -13,7 +13,7 @@ from taojax.audit.evaluate import evaluate
 from taojax.audit.report import write_summary
 from taojax.audit.tables import to_latex, to_markdown
 from taojax.errors import InputError
-from taojax.specs import read_table
+from taojax.tables import read_table
 
 FILES = {
     "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "calibration.toml", "report.html",

@@ -25,11 +25,11 @@ from taojax.datasets.kidnap import (
     noisy_odometry,
 )
 from taojax.datasets.kidnap_folder import folder_source, world_source, write_logs
-from taojax.datasets.simulate import motions as true_motions
+from taojax.datasets.trajectory import motions as true_motions
 from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError
 from taojax.runtime.observations import load_observations
-from taojax.specs import read_table
+from taojax.tables import read_table
 
 
 def small_source(n=200, n_map=220):

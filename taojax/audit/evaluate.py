@@ -13,7 +13,8 @@ from taojax.audit.words import find_words, terminal_table
 from taojax.config import Config
 from taojax.detector import to_toml
 from taojax.records import read_run
-from taojax.specs import table_text, write_atomically
+from taojax.specs import write_atomically
+from taojax.tables import table_text
 
 __all__ = ["Evaluation", "evaluate"]
 

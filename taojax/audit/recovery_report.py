@@ -12,7 +12,8 @@ from taojax.audit.page import Cell, Grid, Page, grid, render
 from taojax.audit.recovery_data import RECORDED, Judged, Part, Rules, load, recovery_rows
 from taojax.audit.verdicts import plain
 from taojax.config import Config, to_toml
-from taojax.specs import table_text, write_atomically
+from taojax.specs import write_atomically
+from taojax.tables import table_text
 
 Row = dict[str, Any]
 

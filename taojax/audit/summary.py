@@ -10,7 +10,7 @@ from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.judgement import Evaluation
 from taojax.audit.tables import Table, from_rows
 from taojax.audit.words import metric_row
-from taojax.specs import table_text
+from taojax.tables import table_text
 
 WHOLE = "full"
 """The scenario whose map was not cut; it carries Table 1 and the micro-scale audit."""

@@ -16,7 +16,8 @@ from taojax.audit.verdicts import plain
 from taojax.config import Config
 from taojax.errors import InputError
 from taojax.records import digest_file, read_manifest
-from taojax.specs import column_names, read_npz, read_table, table_text, write_atomically
+from taojax.specs import column_names, read_npz, write_atomically
+from taojax.tables import read_table, table_text
 
 N_TOP = 10
 """Configurations in the printed table."""

@@ -11,7 +11,8 @@ from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.audit.verdicts import plain
 from taojax.config import AuditConfig
-from taojax.specs import format_number, load_spec, table_text
+from taojax.specs import load_spec
+from taojax.tables import format_number, table_text
 
 NAN = float("nan")
 FUSED = "fused"

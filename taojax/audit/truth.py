@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, Shaped
 
 from taojax.errors import InputError
 from taojax.records import digest_file
-from taojax.specs import read_table
+from taojax.tables import read_table
 
 
 class Truth(NamedTuple):

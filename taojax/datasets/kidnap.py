@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from taojax.datasets.simulate import motions
+from taojax.datasets.trajectory import motions
 from taojax.errors import InputError
 
 __all__ = [

@@ -11,14 +11,8 @@ from taojax.datasets.kidnap import LEVELS, TRIAL_FRAMES, WINDOW_FRAMES, Log, Sou
 from taojax.datasets.simulate import make_world, seen_places
 from taojax.datasets.world import NOTE, WorldConfig
 from taojax.errors import InputError
-from taojax.specs import (
-    read_npy,
-    read_npz,
-    read_table,
-    read_text,
-    table_text,
-    write_atomically,
-)
+from taojax.specs import read_npy, read_npz, read_text, write_atomically
+from taojax.tables import read_table, table_text
 
 __all__ = ["folder_source", "read_poses", "world_source", "write_logs"]
 

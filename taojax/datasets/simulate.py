@@ -23,11 +23,12 @@ from taojax.datasets.appearance import (
     process,
     query_view,
 )
+from taojax.datasets.trajectory import motions
 from taojax.datasets.world import DECIMALS, World, WorldConfig, write_world
 from taojax.errors import ConfigError
 
 __all__ = [
-    "World", "WorldConfig", "describe_routes", "make_world", "motions", "seen_places",
+    "World", "WorldConfig", "describe_routes", "make_world", "seen_places",
     "simulated_odometry", "write_world",
 ]  # fmt: skip
 
@@ -79,23 +80,6 @@ def seen_places(config: WorldConfig, seed: int) -> Float[np.ndarray, "t 2"]:
     """
     # Each knob has its own random stream: without the offset the same places are driven.
     return make_world(replace(config, offset_cap_m=0.0), seed).query_poses[:, 1:3]
-
-
-def motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
-    """Return the true motion into each frame, in body axes of the frame before; row 0 is zero.
-
-    Args:
-        poses: rows (x [m], y [m], theta [rad]).
-
-    Returns:
-        Forward [m], left [m], yaw [rad] in (-pi, pi].
-    """
-    step, theta = np.diff(poses[:, :2], axis=0), poses[:-1, 2]
-    out = np.zeros((len(poses), 3))
-    out[1:, 0] = np.cos(theta) * step[:, 0] + np.sin(theta) * step[:, 1]
-    out[1:, 1] = np.cos(theta) * step[:, 1] - np.sin(theta) * step[:, 0]
-    out[1:, 2] = np.angle(np.exp(1j * np.diff(poses[:, 2])))
-    return out
 
 
 def simulated_odometry(

@@ -8,7 +8,8 @@ import numpy as np
 
 from taojax.errors import InputError
 from taojax.records import digest_file
-from taojax.specs import read_npy, read_npz, read_table, read_text
+from taojax.specs import read_npy, read_npz, read_text
+from taojax.tables import read_table
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,8 @@ from taojax.runtime.observations import load_observations
 from taojax.runtime.score import candidates, facts_of
 from taojax.runtime.stream import Frame
 from taojax.runtime.sweep import at_once, evaluate, plan
-from taojax.specs import table_text, write_atomically
+from taojax.specs import write_atomically
+from taojax.tables import table_text
 
 PARTS = "parts"
 """Folder of finished parts inside an unfinished sweep."""

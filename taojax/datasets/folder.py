@@ -1,0 +1,128 @@
+"""Sessions in, one data folder out: whole or not at all."""
+
+import json
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from taojax.datasets.trajectory import Trajectory
+from taojax.errors import InputError
+from taojax.tables import table_text
+
+__all__ = ["Descriptors", "Lists", "Session", "write_folder"]
+
+BLOCK_ROWS = 4096
+"""Descriptors are copied so many at a time: a map may be larger than the memory."""
+
+POSE = ("t_s", "x_m", "y_m", "theta_rad")
+ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
+
+
+@dataclass(frozen=True)
+class Session:
+    """One drive through a place, as a data set tells it."""
+
+    frames: tuple[str, ...]
+    """(T,) names of the images, in time order; descriptors may be looked up by them."""
+
+    poses: Trajectory
+    """(T,) pose of every frame; of sessions of one data set in one frame (such as UTM)."""
+
+    has_pose: bool = True
+    """False: the data set holds no poses; `poses` is route progress along x."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences that the report must repeat: frames left out, simulated parts, choices made."""
+
+
+@dataclass(frozen=True)
+class Descriptors:
+    """What frames look like; rows as in the sessions."""
+
+    map_rows: Float[np.ndarray, "m d"]
+    """(M, D), may be memory-mapped."""
+
+    query_rows: Float[np.ndarray, "t d"]
+    """(T, D), may be memory-mapped."""
+
+
+@dataclass(frozen=True)
+class Lists:
+    """What a frontend answered; best first."""
+
+    index: Int[np.ndarray, "t k"]
+    """(T, K) rows of the map, -1 = no candidate."""
+
+    similarity: Float[np.ndarray, "t k"]
+    """(T, K) at most 1."""
+
+
+def write_folder(
+    out: Path,
+    mapped: Trajectory,
+    query: tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 3"]],
+    views: Descriptors | Lists,
+    *,
+    truth: Float[np.ndarray, "t 3"] | None,
+    notes: Sequence[str],
+) -> None:
+    """Write a data folder; it appears whole or not at all.
+
+    Args:
+        out: the folder to make.
+        mapped: poses of the map frames, any origin; the first becomes the origin.
+        query: stamps [s] and odometry (forward [m], left [m], yaw [rad]) of the query frames.
+        views: descriptors or retrieval lists.
+        truth: poses of the query frames in the frame of the map; None where nobody knows them.
+        notes: go to about.toml, from there into the manifest and the report.
+
+    Raises:
+        InputError: `out` exists, cannot be written, or a value is not finite.
+    """
+    if out.exists():
+        raise InputError(f"{out}: exists already; choose a new folder")
+    part = out.with_name(f".{out.name}.{secrets.token_hex(6)}.part")
+    try:
+        for name in ("map", "query", *(("truth",) if truth is not None else ())):
+            (part / name).mkdir(parents=True)
+        origin = np.array([[*mapped.xyt[0, :2], 0.0]])
+        files = {
+            "map/poses.csv": _table("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
+            "query/odometry.csv": _table("query_odometry", ODOMETRY, *query),
+            "about.toml": f"notes = {json.dumps(list(notes), ensure_ascii=False)}\n",
+        }
+        if truth is not None:
+            files["truth/query_poses.csv"] = _table("query_poses", POSE, query[0], truth - origin)
+        for name, text in files.items():
+            (part / name).write_text(text, encoding="utf-8")
+        if isinstance(views, Lists):
+            np.savez(part / "query/retrievals.npz", index=views.index, similarity=views.similarity)
+        else:
+            _copy_rows(views.map_rows, part / "map/descriptors.npy")
+            _copy_rows(views.query_rows, part / "query/descriptors.npy")
+        part.rename(out)
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}); choose another folder"
+        ) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _table(spec: str, names: Sequence[str], t_s: np.ndarray, columns: np.ndarray) -> str:
+    # Stamps count from the first: nine digits cannot hold UNIX time to the millisecond.
+    return table_text(spec, dict(zip(names, (t_s - t_s[0], *columns.T), strict=True)))
+
+
+def _copy_rows(rows: np.ndarray, path: Path) -> None:
+    # Half precision stays: it is what the network wrote.
+    kind = np.float16 if rows.dtype == np.float16 else np.float32
+    out = np.lib.format.open_memmap(path, mode="w+", dtype=kind, shape=rows.shape)
+    for start in range(0, len(rows), BLOCK_ROWS):
+        out[start : start + BLOCK_ROWS] = rows[start : start + BLOCK_ROWS]
+    out.flush()
