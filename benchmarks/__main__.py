@@ -23,6 +23,9 @@ def _parser() -> argparse.ArgumentParser:
     ablation.add_argument("--out", type=Path, help="folder to make (default runs/ablation/TIME)")
     ablation.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     ablation.add_argument("--only", default="", help="only data sets whose name contains this")
+    progress = verbs.add_parser("progress", help="the paper's Table 3: no poses")
+    progress.add_argument("--out", type=Path, help="folder to make (default runs/progress/TIME)")
+    progress.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     refinement = verbs.add_parser("refinement", help="what the true Huber minimum buys and costs")
     refinement.add_argument("--quick", action="store_true", help="500 windows instead of 10,000")
     refinement.add_argument(
@@ -50,6 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import ablation
 
         ablation.run(out, args.data, only=args.only)
+    elif args.verb == "progress":
+        from benchmarks import progress
+
+        progress.run(out, args.data)
     elif args.verb == "refinement":
         from benchmarks import refinement
 

@@ -16,7 +16,18 @@ from taojax.errors import (
     TaojaxError,
     UsageError,
 )
-from taojax.verbs import audit, bench, evaluate, export, kidnap, score, simulate, sweep
+from taojax.verbs import (
+    audit,
+    bench,
+    convert,
+    evaluate,
+    export,
+    inspect,
+    kidnap,
+    score,
+    simulate,
+    sweep,
+)
 from taojax.verbs.common import say
 
 ABOUT = "Am I lost, or just somewhere new, and may this loop closure enter my graph?"
@@ -25,6 +36,8 @@ Verb = (
     audit.Audit
     | score.Score
     | evaluate.Evaluate
+    | convert.Convert
+    | inspect.Inspect
     | simulate.Simulate
     | kidnap.Kidnap
     | sweep.Sweep
@@ -35,6 +48,8 @@ RUN = {
     audit.Audit: audit.run,
     score.Score: score.run,
     evaluate.Evaluate: evaluate.run,
+    convert.Convert: convert.run,
+    inspect.Inspect: inspect.run,
     simulate.Simulate: simulate.run,
     kidnap.Kidnap: kidnap.run,
     sweep.Sweep: sweep.run,

@@ -17,7 +17,7 @@ from taojax.core.se2 import compose, transform
 N = 12
 one = eqx.filter_jit(branch_cost)
 many = eqx.filter_jit(jax.vmap(branch_cost, in_axes=(None, None, 0, None)))
-fit = jax.jit(fit_se2)
+fit = jax.jit(lambda p, q, weight, prior: fit_se2(p, q, weight, prior=prior))
 
 
 def params(lam=1.0, gamma=1.0, tau=1.0, delta=3.0, mask=9.0):
@@ -243,6 +243,21 @@ def test_gradients_are_finite_everywhere(kind):
     has = np.ones(len(p), bool) if has is None else has
     for gradient in gradients(jnp.asarray(p), jnp.asarray(q), 1.0, 1.0, 3.0, jnp.asarray(has)):
         assert np.isfinite(gradient).all()
+
+
+def test_branches_that_trail_cost_the_same_as_one_by_one(rng):
+    p, q = (a.astype(np.float32) for a in window(rng))
+    k = 23
+    qs = jnp.asarray(q[None] + rng.normal(0, 20, (k, N, 2)).astype(np.float32))
+    has = jnp.asarray(rng.random((k, N)) < 0.8)
+    similarity = jnp.asarray(rng.random((k, N)), jnp.float32)
+    weight = jnp.full(N, 1.0 / N)
+    leading = many(params(), jnp.asarray(p), Branch(qs, similarity, has), weight)
+    innermost = Branch(jnp.moveaxis(qs, 0, 1), similarity.T, has.T)
+    got = one(params(), jnp.asarray(p), innermost, weight)
+    np.testing.assert_allclose(got.total, leading.total, rtol=1e-4)
+    np.testing.assert_allclose(got.T_map_odom, leading.T_map_odom, rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(got.is_inlier.T, leading.is_inlier)
 
 
 def test_one_hopeless_branch_does_not_disturb_its_neighbours(rng):

@@ -9,11 +9,10 @@ import reference
 from conftest import loop, motions
 
 from taojax.config import Config, StreamConfig
-from taojax.core.cost import Branch
 from taojax.records import signal_names
-from taojax.runtime import score, stream
+from taojax.runtime import score
 from taojax.runtime.maps import MapTables, map_spacing_m, map_tables
-from taojax.runtime.stream import STATUSES, Frame, cost_params, init, replay, step
+from taojax.runtime.stream import STATUSES, Frame, init, replay, step
 
 SMALL = StreamConfig(window=8, branches=6, joint_window=8, joint_seeds=4)
 RANK = StreamConfig(window=8, branches=6, association="rank")
@@ -324,18 +323,3 @@ def test_the_recursive_filter_counts_as_far_as_the_map_tells_its_places_apart(rn
     added = signals["tao"] - signals["tao_align"]
     np.testing.assert_allclose(added, recall**SMALL.window * signals["recursive"], atol=1e-6)
     assert signals["recursive"].max() > 0.01
-
-
-def test_many_branches_cost_the_same_a_few_at_a_time(rng, monkeypatch):
-    tables, _ = log(rng)
-    k, n = 23, 6
-    branches = Branch(
-        jnp.asarray(rng.normal(0, 20, (k, n, 2)), jnp.float32),
-        jnp.asarray(rng.random((k, n)), jnp.float32),
-        jnp.asarray(rng.random((k, n)) < 0.9),
-    )
-    given = cost_params(SMALL, tables), jnp.asarray(rng.normal(0, 9, (n, 2)), jnp.float32)
-    together = stream._rank_costs(*given, branches, jnp.full(n, 1.0 / n))
-    monkeypatch.setattr(stream, "CPU_NUMBERS", 5 * n)  # five branches, and three are left over
-    apart = stream._rank_costs(*given, branches, jnp.full(n, 1.0 / n))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), together, apart)

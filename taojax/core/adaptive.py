@@ -12,6 +12,8 @@ Source:
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from taojax.core.sums import running
+
 LENGTHS = (2, 3, 5, 8, 13, 20, 30, 45, 60)
 """Windows compared, frames, about half an octave apart."""
 
@@ -36,8 +38,7 @@ def adaptive_mean(
         variance m (1 - m) that a mean m leaves to a cost in [0, 1].
     """
     costs = jnp.where(is_filled, newest_first, 0.0)
-    total = jnp.cumsum(costs)
-    n_filled = jnp.sum(is_filled.astype(costs.dtype))
+    total, n_filled = running(costs), running(is_filled.astype(costs.dtype))[-1]
     low, high = jnp.full((), -jnp.inf), jnp.full((), jnp.inf)
     kept, is_alive = newest_first[0], jnp.ones((), bool)
     for length in LENGTHS:

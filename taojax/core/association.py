@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from taojax.core.cost import huber, squared_residuals
 from taojax.core.procrustes import AngleEvidence, fit_se2
 from taojax.core.se2 import transform
+from taojax.core.sums import over_frames
 
 ROUNDS = 1
 """Alternations per frame; a second one changed no result and doubles the work."""
@@ -262,7 +263,7 @@ def refit(
     prior = AngleEvidence(
         params.kappa * jnp.cos(theta0), params.kappa * jnp.sin(theta0), jnp.asarray(params.kappa)
     )
-    fit = fit_se2(window.p, pairing.q, weight, prior)
+    fit = fit_se2(window.p, pairing.q, weight, prior=prior)
     return jnp.where(fit.is_degenerate, pose, fit.T_map_odom)
 
 
@@ -275,7 +276,7 @@ def objective(
 ) -> Float[Array, ""]:
     """Return J of a pairing evaluated at `pose`, which both half steps can only lower."""
     truncated = jnp.minimum(params.gamma, pairing.geom + pairing.sim)
-    return jnp.sum(window.weight * truncated) + params.kappa * (1.0 - jnp.cos(pose[2] - theta0))
+    return over_frames(window.weight * truncated) + params.kappa * (1.0 - jnp.cos(pose[2] - theta0))
 
 
 def joint_branch(
@@ -300,8 +301,8 @@ def joint_branch(
     supported = jnp.where(is_inlier, window.weight, 0.0)
     return JointBranch(
         cost=objective(params, window, pairing, pose, seed[2]),
-        geom=jnp.sum(supported * jnp.where(is_inlier, pairing.geom, 0.0)),
-        sim=jnp.sum(supported * pairing.sim),
+        geom=over_frames(supported * jnp.where(is_inlier, pairing.geom, 0.0)),
+        sim=over_frames(supported * pairing.sim),
         T_map_odom=pose,
         anchor=pairing.anchor,
         frame_cost=jnp.minimum(params.gamma, pairing.geom + pairing.sim),

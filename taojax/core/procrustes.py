@@ -6,27 +6,46 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from taojax.core.se2 import rotate
+from taojax.core.sums import over_frames, trailing
+
+
+class VectorPairs(NamedTuple):
+    """Weighted pairs of vectors: x in one frame, y in another. Branches, if any, trail."""
+
+    x: Float[Array, "n *#k 2"]
+    y: Float[Array, "n *k 2"]
+    weight: Float[Array, "n *k"]
 
 
 class AngleEvidence(NamedTuple):
     """What pairs of vectors say of the angle between them; sums of evidence add up."""
 
-    dot: Float[Array, ""]
+    dot: Float[Array, "*k"]
     """Sum of w x . y, the trace of the cross-covariance [m^2]."""
 
-    cross: Float[Array, ""]
+    cross: Float[Array, "*k"]
     """Sum of w x cross y, its antisymmetric part [m^2]."""
 
-    scale: Float[Array, ""]
+    scale: Float[Array, "*k"]
     """Upper bound of hypot(dot, cross), reached when all pairs agree [m^2]."""
 
 
 class RigidFit(eqx.Module):
     """An alignment, and whether the pairs determine it."""
 
-    T_map_odom: Float[Array, "*k 3"]
+    shift: Float[Array, "*k 2"]
+    """Where the local origin lies in the map [m]."""
+
+    turn: Float[Array, "*k 2"]
+    """Cosine and sine of the angle: what rotates points, without computing them again."""
+
     is_degenerate: Bool[Array, "*k"]
+
+    @property
+    def T_map_odom(self) -> Float[Array, "*k 3"]:
+        """The alignment as a pose: x [m], y [m], theta [rad]."""
+        theta = jnp.arctan2(self.turn[..., 1], self.turn[..., 0])
+        return jnp.concatenate([self.shift, theta[..., None]], axis=-1)
 
 
 class Diagnostics(eqx.Module):
@@ -53,27 +72,35 @@ def _safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
 
 
-def weighted_mean(p: Float[Array, "n 2"], weight: Float[Array, " n"]) -> Float[Array, "2"]:
+def weighted_mean(p: Float[Array, "n *#k 2"], weight: Float[Array, "n *k"]) -> Float[Array, "*k 2"]:
     """Return the weighted mean of points, zero where there is no weight at all."""
-    total = jnp.sum(weight)
-    return jnp.sum(weight[:, None] * p, axis=0) / jnp.where(total > 0, total, 1.0)
+    total = over_frames(weight)
+    share = 1.0 / jnp.where(total > 0, total, 1.0)
+    axes = [share * over_frames(weight * p[..., axis]) for axis in range(2)]
+    return jnp.stack(axes, axis=-1)
 
 
-def angle_evidence(
-    x: Float[Array, "n 2"], y: Float[Array, "n 2"], weight: Float[Array, " n"]
-) -> AngleEvidence:
-    """Sum what weighted pairs of vectors say of the rotation that takes x to y."""
-    dot = jnp.sum(weight * (x[:, 0] * y[:, 0] + x[:, 1] * y[:, 1]))
-    cross = jnp.sum(weight * (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]))
-    lengths = jnp.sum(weight * jnp.sum(x**2, axis=-1)) * jnp.sum(weight * jnp.sum(y**2, axis=-1))
-    return AngleEvidence(dot, cross, _safe_sqrt(lengths))
+def angle_evidence(*pairs: VectorPairs) -> AngleEvidence:
+    """Sum what weighted pairs of vectors say of the rotation that takes x to y.
+
+    Args:
+        pairs: groups of equally many pairs; they are added before they are summed.
+    """
+    dot, cross, scale = 0.0, 0.0, 0.0
+    for x, y, weight in pairs:
+        (x0, x1), (y0, y1) = (x[..., 0], x[..., 1]), (y[..., 0], y[..., 1])
+        dot = dot + weight * (x0 * y0 + x1 * y1)
+        cross = cross + weight * (x0 * y1 - x1 * y0)
+        scale = scale + weight * jnp.sqrt((x0**2 + x1**2) * (y0**2 + y1**2))
+    return AngleEvidence(*(over_frames(jnp.asarray(part)) for part in (dot, cross, scale)))
 
 
 def fit_se2(
     p: Float[Array, "n 2"],
-    q: Float[Array, "n 2"],
-    weight: Float[Array, " n"],
-    *more: AngleEvidence,
+    q: Float[Array, "n *k 2"],
+    weight: Float[Array, "n *k"],
+    *more: VectorPairs,
+    prior: AngleEvidence | None = None,
 ) -> RigidFit:
     r"""Find the SE(2) transform that best carries local points p onto anchors q.
 
@@ -83,12 +110,14 @@ def fit_se2(
 
     Args:
         p: `(n, 2)` points in the odometry frame, metres.
-        q: `(n, 2)` the map position each one is believed to be at, metres.
-        weight: `(n,)` non-negative; 0 switches a pair off. Need not sum to one, but its scale sets
-            the balance against `more`.
-        more: further evidence on the angle: the velocity term of Eq. 1 contributes
-            2 lambda mean(dp dq^T), a heading prior kappa (1 - cos(theta - theta0)) contributes
-            kappa (cos theta0, sin theta0).
+        q: `(n, 2)` the map position each one is believed to be at, metres; `(n, k, 2)` for k
+            branches at once, which lie innermost in memory: XLA on a CPU vectorises over them.
+        weight: `(n,)` or `(n, k)`, non-negative; 0 switches a pair off. Need not sum to one, but
+            its scale sets the balance against what follows.
+        more: n further pairs each that share the rotation but not the shift: the velocity term of
+            Eq. 1 is the steps of p and q with weights 2 lambda / (number of steps).
+        prior: evidence known beforehand: a heading prior kappa (1 - cos(theta - theta0)) is
+            kappa (cos theta0, sin theta0, 1).
 
     Returns:
         `T_map_odom` (x [m], y [m], theta [rad]) and `is_degenerate`: no weight, or nothing fixes
@@ -98,19 +127,21 @@ def fit_se2(
     Source:
         Umeyama, IEEE TPAMI 13(4), 1991, specialised to dimension 2 and scale 1; paper, Eq. 1.
     """
+    p = trailing(p, weight)
     p_mean, q_mean = weighted_mean(p, weight), weighted_mean(q, weight)
-    pairs = angle_evidence(p - p_mean[None, :], q - q_mean[None, :], weight)
-    dot = sum((e.dot for e in more), pairs.dot)
-    cross = sum((e.cross for e in more), pairs.cross)
-    scale = sum((e.scale for e in more), pairs.scale)
+    centred = p - p_mean[None], q - q_mean[None]
+    found = angle_evidence(VectorPairs(*centred, weight), *more)
+    dot, cross, scale = found if prior is None else map(jnp.add, found, prior)
     # Relative, so that millimetres and kilometres are judged alike, and written so that NaN is bad.
     tolerance = 100.0 * jnp.finfo(p.dtype).eps
     strength = _safe_sqrt(dot**2 + cross**2)
-    is_degenerate = ~((strength > tolerance * scale) & (jnp.sum(weight) > 0))
-    # Give atan2 a harmless point when degenerate, so that its gradient stays finite.
-    theta = jnp.arctan2(jnp.where(is_degenerate, 0.0, cross), jnp.where(is_degenerate, 1.0, dot))
-    xy = q_mean - rotate(theta, p_mean)
-    return RigidFit(jnp.concatenate([xy, theta[None]]), is_degenerate)
+    is_degenerate = ~((strength > tolerance * scale) & (over_frames(weight) > 0))
+    # A harmless division when degenerate, so that its gradient stays finite.
+    unit = 1.0 / jnp.where(is_degenerate, 1.0, strength)
+    c, s = jnp.where(is_degenerate, 1.0, dot * unit), jnp.where(is_degenerate, 0.0, cross * unit)
+    x, y = p_mean[..., 0], p_mean[..., 1]
+    shift = q_mean - jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
+    return RigidFit(shift, jnp.stack([c, s], axis=-1), is_degenerate)
 
 
 def diagnose(
@@ -135,10 +166,8 @@ def diagnose(
     Source:
         Paper, section 3.2; closed form of the 2 x 2 singular values.
     """
-    x = p - weighted_mean(p, weight)[None, :]
-    y = q - weighted_mean(q, weight)[None, :]
-    h00, h01 = jnp.sum(weight * x[:, 0] * y[:, 0]), jnp.sum(weight * x[:, 0] * y[:, 1])
-    h10, h11 = jnp.sum(weight * x[:, 1] * y[:, 0]), jnp.sum(weight * x[:, 1] * y[:, 1])
+    x, y = p - weighted_mean(p, weight)[None], q - weighted_mean(q, weight)[None]
+    (h00, h01), (h10, h11) = jnp.dot(x.T * weight[None], y, precision="highest")
     turn = _safe_sqrt((h00 + h11) ** 2 + (h10 - h01) ** 2)
     flip = _safe_sqrt((h00 - h11) ** 2 + (h10 + h01) ** 2)
     s1 = 0.5 * (turn + flip)

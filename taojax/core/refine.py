@@ -21,10 +21,10 @@ from taojax.core.cost import (
     Branch,
     CostParams,
     cost_terms,
-    pair_weights,
     squared_residuals,
+    step_pairs,
 )
-from taojax.core.procrustes import angle_evidence, fit_se2, weighted_mean
+from taojax.core.procrustes import fit_se2, weighted_mean
 from taojax.core.se2 import rotate, wrap
 
 STATUSES = ("converged", "stalled", "degenerate", "not_finite")
@@ -81,12 +81,11 @@ def _solve(
     gap = jnp.where(is_on[:, None], branch.q - target[None, :], 0.0) / unit_m
     y = rotate(jnp.broadcast_to(-start[2], is_on.shape), gap)
     delta = params.delta_m / unit_m
-    pair = 2.0 * params.lambda_velocity * pair_weights(is_on, p)
-    velocity = angle_evidence(x[1:] - x[:-1], y[1:] - y[:-1], pair)
+    steps = step_pairs(x, y, is_on, 2.0 * params.lambda_velocity)
 
     def again(pose: Float[Array, "3"], _: None) -> Float[Array, "3"]:
         r = jnp.sqrt(jnp.maximum(squared_residuals(pose, x, y), delta**2))
-        return fit_se2(x, y, w * delta / r, velocity).T_map_odom
+        return fit_se2(x, y, w * delta / r, steps).T_map_odom
 
     found = optx.fixed_point(
         again,
@@ -98,7 +97,7 @@ def _solve(
     theta = start[2] + found.value[2]
     shift = target + unit_m * rotate(start[2], found.value[:2])
     pose = jnp.concatenate([shift - rotate(theta, centre), wrap(theta)[None]])
-    is_degenerate = fit_se2(x, y, w, velocity).is_degenerate | (jnp.sum(is_on) < MIN_PAIRS)
+    is_degenerate = fit_se2(x, y, w, steps).is_degenerate | (jnp.sum(is_on) < MIN_PAIRS)
     is_converged = found.result == optx.RESULTS.successful
     status = jnp.where(is_converged, CONVERGED, STALLED)
     return pose, jnp.where(is_degenerate, DEGENERATE, status), found.stats["num_steps"]

@@ -9,6 +9,7 @@ from taojax.config import StreamConfig
 from taojax.core.adaptive import adaptive_mean
 from taojax.core.association import look_up
 from taojax.core.cost import BranchCost, squared_residuals
+from taojax.core.sums import over_frames
 from taojax.runtime.choice import since_support
 from taojax.runtime.joint import JointReading
 from taojax.runtime.maps import MapTables
@@ -34,18 +35,23 @@ class Answer(NamedTuple):
     """There is a hypothesis at all."""
 
 
+def _share(is_inlier: Bool[Array, " n"], is_filled: Bool[Array, " n"]) -> Float[Array, ""]:
+    n_in, n = over_frames(jnp.stack([is_inlier, is_filled], axis=1).astype(jnp.float32))
+    return n_in / n
+
+
 def rank_answer(
-    best: BranchCost, is_filled: Array, map_index: Array, has_candidates: Array
+    costs: BranchCost, best: Array, is_filled: Array, map_index: Array, has_candidates: Array
 ) -> Answer:
     """Return the answer of the best rank branch."""
-    n_filled = jnp.sum(is_filled.astype(best.geom.dtype))
+    is_inlier = costs.is_inlier[:, best]
     return Answer(
-        pose=best.T_map_odom,
+        pose=costs.T_map_odom[best],
         map_index=map_index,
-        share=jnp.sum(best.is_inlier.astype(best.geom.dtype)) / n_filled,
-        stale=since_support(best.is_inlier[::-1]),
+        share=_share(is_inlier, is_filled),
+        stale=since_support(is_inlier[::-1]),
         is_lost=jnp.zeros((), bool),  # the literal cost knows no jumps
-        is_degenerate=best.is_degenerate,
+        is_degenerate=costs.is_degenerate[best],
         is_known=has_candidates,
     )
 
@@ -53,12 +59,11 @@ def rank_answer(
 def joint_answer(tables: MapTables, reading: JointReading) -> Answer:
     """Return the answer of the best joint branch."""
     best, said = reading.best, reading.report
-    n_filled = jnp.sum(reading.is_filled.astype(best.cost.dtype))
     nearest = look_up(tables.grid, said.pose[:2])
     return Answer(
         pose=said.pose,
         map_index=jnp.where(said.anchor >= 0, said.anchor, nearest),
-        share=jnp.sum(best.is_inlier.astype(best.cost.dtype)) / n_filled,
+        share=_share(best.is_inlier, reading.is_filled),
         stale=said.stale,
         is_lost=said.is_jump,
         # The heading prior determines the angle; without any inlier the seed itself is the pose.
@@ -89,7 +94,7 @@ def joint_terms(
     turn = jnp.concatenate([jnp.zeros(2), best.T_map_odom[2:]])
     mismatch = squared_residuals(turn, jnp.diff(reading.p, axis=0), jnp.diff(q, axis=0))
     pair = (best.is_inlier[1:] & best.is_inlier[:-1]).astype(mismatch.dtype)
-    mean = jnp.sum(pair * mismatch) / jnp.maximum(jnp.sum(pair), 1.0)
+    total, n_pairs = over_frames(jnp.stack([pair * mismatch, pair], axis=1))
     align = adaptive_mean(best.frame_cost[::-1], reading.is_filled[::-1])
     # A filter multiplies answers, so one confused place undoes it: it counts as much as a whole
     # window of answers is free of confusion on this map.
@@ -98,7 +103,7 @@ def joint_terms(
         "tao_align": align,
         "tao_geom": best.geom,
         # A term to look at; it couples neighbours, so it is no part of the joint objective.
-        "tao_vel": config.lambda_velocity * mean / delta_m**2,
+        "tao_vel": config.lambda_velocity * total / jnp.maximum(n_pairs, 1.0) / delta_m**2,
         "tao_sim": best.sim,
         "tao_window": best.cost,
         "tao_rival": reading.rival,

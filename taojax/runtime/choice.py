@@ -6,11 +6,13 @@ branch collects evidence over the newest frames, and takes over when it has enou
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.core.association import JointBranch, JointParams, JointWindow, Pairing, refit
 from taojax.core.cost import squared_residuals
+from taojax.core.sums import first, least, over_frames, running
 
 JUMP_FRAMES = 25
 """A jump lies at most so many frames back where a map tells all its places apart, fewer elsewhere;
@@ -79,13 +81,13 @@ def jump_evidence(
     n = min(JUMP_FRAMES, frame_cost.shape[1])
     saved = frame_cost[favourite][None, :n] - frame_cost[:, :n]
     saved = jnp.where(is_filled[None, :n], saved, 0.0)
-    total = jnp.cumsum(is_filled.astype(frame_cost.dtype))
-    good = jnp.cumsum((is_inlier & is_filled).astype(frame_cost.dtype))
+    counted = jnp.stack([is_filled, is_inlier & is_filled]).astype(frame_cost.dtype)
+    total, good = running(counted)
     start = jnp.arange(n)
     stop = jnp.minimum(start + PAST_FRAMES, total.shape[0] - 1)
     share = (good[stop] - good[start] + 1.0) / (total[stop] - total[start] + 2.0)
     slope = jnp.maximum(jnp.log(MOST_RELIABLE / (1.0 - share)), LEAST_SLOPE)
-    evidence = recall * slope[None] * jnp.cumsum(saved, axis=1)
+    evidence = recall * slope[None] * running(saved)
     is_recent = start.astype(recall.dtype) < JUMP_FRAMES * recall
     return jnp.max(jnp.where(is_recent[None], evidence, -jnp.inf), axis=1)
 
@@ -93,12 +95,12 @@ def jump_evidence(
 def since_support(is_inlier: Bool[Array, " n"]) -> Float[Array, ""]:
     """Return the frames before the first inlier, newest first; their number without any."""
     n = is_inlier.shape[0]
-    return jnp.where(jnp.any(is_inlier), jnp.argmax(is_inlier), n).astype(jnp.float32)
+    return jnp.min(jnp.where(is_inlier, jnp.arange(n), n)).astype(jnp.float32)
 
 
 def _fading(age: Int[Array, " n"], is_filled: Bool[Array, " n"], frames: float) -> Array:
     weight = jnp.where(is_filled, jnp.exp(-age.astype(jnp.float32) / frames), 0.0)
-    return weight / jnp.sum(weight)
+    return weight / over_frames(weight)
 
 
 def _pose_now(
@@ -140,7 +142,7 @@ def report(  # noqa: PLR0913 - one argument per thing looked at
     """
     n = age.shape[0]
     is_filled = window.weight > 0
-    newest_first = jnp.argmin(age) - jnp.arange(n)
+    newest_first = first(age == 0) - jnp.arange(n)
     in_turn = jnp.mod(newest_first, n)
     evidence = jump_evidence(
         branches.frame_cost[:, in_turn],
@@ -150,26 +152,28 @@ def report(  # noqa: PLR0913 - one argument per thing looked at
         recall,
     )
     evidence = jnp.where(is_live, evidence, -jnp.inf)
-    challenger = jnp.argmax(evidence)
+    challenger = least(-evidence)
     is_jump = evidence[challenger] > JUMP_EVIDENCE
     chosen = jnp.where(is_jump, challenger, favourite)
 
     gap = branches.T_map_odom - branches.T_map_odom[chosen][None]
-    is_near = jnp.sum(gap[:, :2] ** 2, axis=1) < (LOCAL_DELTAS * params.delta_m) ** 2
+    is_near = gap[:, 0] ** 2 + gap[:, 1] ** 2 < (LOCAL_DELTAS * params.delta_m) ** 2
     is_same = is_near & (jnp.cos(gap[:, 2]) > 0) & is_live
-    local = jnp.sum(_fading(age, is_filled, LOCAL_FRAMES)[None] * branches.frame_cost, axis=1)
-    exact = jnp.argmin(jnp.where(is_same, local, jnp.inf))
+    local = over_frames(_fading(age, is_filled, LOCAL_FRAMES)[:, None] * branches.frame_cost.T)
+    exact = least(jnp.where(is_same, local, jnp.inf))
     short = eqx.tree_at(lambda w: w.weight, window, _fading(age, is_filled, POSE_FRAMES))
 
     def now(row: Array) -> Float[Array, "3"]:
         anchor, cost = branches.anchor[row], branches.frame_cost[row]
         return _pose_now(params, xy, short, anchor, cost, branches.T_map_odom[row])
 
+    # Together: two matrix products of two columns are cheaper than four sums.
+    exactly, challenging = jax.vmap(now)(jnp.stack([exact, challenger]))
     inlier = branches.is_inlier[exact][in_turn]
     return Report(
-        pose=now(exact),
+        pose=exactly,
         anchor=jnp.where(inlier[0], branches.anchor[exact][in_turn[0]], -1),
         is_jump=is_jump,
         stale=since_support(inlier),
-        challenger=now(challenger),
+        challenger=challenging,
     )

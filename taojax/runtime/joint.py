@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from taojax.config import StreamConfig
 from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch, pool
 from taojax.core.se2 import compose, inverse, transform
+from taojax.core.sums import least, over_frames
 from taojax.runtime.choice import Report, report
 from taojax.runtime.maps import MapTables
 
@@ -133,7 +134,7 @@ def joint_step(
     is_filled = state.is_filled.at[slot].set(True)
     age = jnp.mod(slot - jnp.arange(n), n)
     decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
-    window = JointWindow(p, decay / jnp.sum(decay), listed, similarity, pooled)
+    window = JointWindow(p, decay / over_frames(decay), listed, similarity, pooled)
 
     carried = compose(state.carried, jnp.broadcast_to(odometry, (2, 3)))
     seeds = _seeds(config, tables, index, carried)
@@ -147,10 +148,10 @@ def joint_step(
     is_live = is_live | ~jnp.any(is_live)
     # The challenger answers for jumps alone: one more guess would make every place look better.
     cost = jnp.where(is_live, branches.cost, jnp.inf).at[-1].set(jnp.inf)
-    winner = jnp.argmin(cost)
+    winner = least(cost)
     best: JointBranch = jax.tree.map(lambda leaf: leaf[winner], branches)
     gap = branches.T_map_odom[:, :2] - best.T_map_odom[None, :2]
-    is_elsewhere = jnp.sum(gap**2, axis=1) > (DISTINCT_DELTAS * params.delta_m) ** 2
+    is_elsewhere = gap[:, 0] ** 2 + gap[:, 1] ** 2 > (DISTINCT_DELTAS * params.delta_m) ** 2
     rival = jnp.minimum(GAMMA, jnp.min(jnp.where(is_elsewhere, cost, GAMMA)))
     said = report(params, tables.grid.xy, window, branches, winner, is_live, age, tables.recall)
 

@@ -11,6 +11,13 @@ from taojax.records import digest_file
 from taojax.specs import read_npy, read_npz, read_text
 from taojax.tables import read_table
 
+DESCRIPTORS = (
+    ("map/descriptors.npy", "query/descriptors.npy"),
+    # As VPR-methods-evaluation writes them.
+    ("database_descriptors.npy", "queries_descriptors.npy"),
+)
+"""The names that map and query descriptors may have in a data folder; one pair is there."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Retrievals:
@@ -77,8 +84,24 @@ def _check_finite(path: Path, array: np.ndarray, label: str = "") -> None:
             )
 
 
-def _load_descriptors(folder: Path, n_map: int, n_query: int) -> tuple[np.ndarray, np.ndarray]:
-    paths = folder / "map/descriptors.npy", folder / "query/descriptors.npy"
+def descriptor_names(folder: Path) -> tuple[str, str]:
+    """Return the names of a data folder's map and query descriptors.
+
+    Raises:
+        InputError: files of both pairs of names are there.
+    """
+    there = [[name for name in pair if (folder / name).exists()] for pair in DESCRIPTORS]
+    if all(there):
+        raise InputError(
+            f"{folder}: holds {there[0][0]} and {there[1][0]}; keep one pair of descriptors"
+        )
+    return DESCRIPTORS[1 if there[1] else 0]
+
+
+def _load_descriptors(
+    folder: Path, names: tuple[str, str], n_map: int, n_query: int
+) -> tuple[np.ndarray, np.ndarray]:
+    paths = folder / names[0], folder / names[1]
     poses = folder / "map/poses.csv", folder / "query/odometry.csv"
     arrays = []
     for path, other, n_rows in zip(paths, poses, (n_map, n_query), strict=True):
@@ -172,8 +195,9 @@ def load_observations(folder: Path) -> Observations:
         retrievals = _load_retrievals(lists, n_map, n_query, folder / files[1])
         files.append("query/retrievals.npz")
     else:
-        descriptors = _load_descriptors(folder, n_map, n_query)
-        files += ["map/descriptors.npy", "query/descriptors.npy"]
+        names = descriptor_names(folder)
+        descriptors = _load_descriptors(folder, names, n_map, n_query)
+        files += names
     notes, trial_frames = _load_about(folder / "about.toml", n_query)
     files += ["about.toml"] if (folder / "about.toml").exists() else []
     motion = np.stack([odometry[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)

@@ -7,6 +7,9 @@ missing one has similarity 0.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from taojax.core.procrustes import weighted_mean
+from taojax.core.sums import over_frames
+
 WINDOWS = (5, 10, 20)
 """Lengths of the windowed top-1 signals, frames."""
 
@@ -20,18 +23,17 @@ def top1(similarity: Float[Array, " k"]) -> Float[Array, ""]:
     return 1.0 - similarity[0]
 
 
-def windowed(history: Float[Array, " w"], n_seen: Int[Array, ""], length: int) -> Float[Array, ""]:
-    """Return the mean of a signal over its last frames.
+def windowed(history: Float[Array, " w"], n_seen: Int[Array, ""]) -> Float[Array, " l"]:
+    """Return the means of a signal over its last frames, one per length in `WINDOWS`.
 
     Args:
         history: oldest first, newest last.
         n_seen: how many entries are filled, from the end.
-        length: frames to average, at most len(history).
     """
-    age = jnp.arange(history.shape[0])[::-1]
-    is_in = (age < length) & (age < n_seen)
-    count = jnp.sum(is_in.astype(history.dtype))
-    return jnp.sum(jnp.where(is_in, history, 0.0)) / jnp.maximum(count, 1.0)
+    age = jnp.arange(history.shape[0])[::-1, None]
+    lengths = jnp.minimum(jnp.asarray(WINDOWS), n_seen)
+    is_in = (age < lengths[None]).astype(history.dtype)
+    return over_frames(is_in * history[:, None]) / jnp.maximum(lengths.astype(history.dtype), 1.0)
 
 
 def margin(similarity: Float[Array, " k"]) -> Float[Array, ""]:
@@ -48,9 +50,10 @@ def entropy(
     """Return the entropy of the softmax of the similarities [nat]; log K without candidates."""
     logits = (similarity - similarity[0]) / temperature
     weight = jnp.where(is_there, jnp.exp(logits), 0.0)
-    total = jnp.sum(weight)
-    share = weight / jnp.where(total > 0, total, 1.0)
-    nats = -jnp.sum(jnp.where(share > 0, share * jnp.log(jnp.where(share > 0, share, 1.0)), 0.0))
+    # -sum p log p with p = w / total, where log w is the logit.
+    total, energy = over_frames(jnp.stack([weight, weight * jnp.where(is_there, logits, 0.0)], 1))
+    safe = jnp.where(total > 0, total, 1.0)
+    nats = jnp.maximum(jnp.log(safe) - energy / safe, 0.0)
     return jnp.where(total > 0, nats, jnp.log(float(similarity.shape[0])))
 
 
@@ -80,9 +83,8 @@ def sue(
     n = min(SUE_CANDIDATES, similarity.shape[0])
     logits = SUE_SHARPNESS * (similarity[:n] - similarity[0])
     weight = jnp.where(is_there[:n], jnp.exp(logits), 0.0)
-    total = jnp.sum(weight)
-    weight = weight / jnp.where(total > 0, total, 1.0)
     # Relative to the best candidate, so that far-off map coordinates cost no digits.
     offset = positions[:n] - positions[:1]
-    mean = jnp.sum(weight[:, None] * offset, axis=0, keepdims=True)
-    return jnp.sum(weight[:, None] * (offset - mean) ** 2)
+    mean = weighted_mean(offset, weight)
+    across, up = weighted_mean((offset - mean[None]) ** 2, weight)
+    return across + up

@@ -15,15 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import (
-    Branch,
-    BranchCost,
-    CostParams,
-    branch_cost,
-    huber,
-)
+from taojax.core.cost import Branch, CostParams, branch_cost, huber
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
+from taojax.core.sums import least, over_frames
 from taojax.runtime import signals
 from taojax.runtime.answer import joint_answer, joint_terms, rank_answer
 from taojax.runtime.joint import JointReading, JointState, init_joint, joint_step
@@ -33,10 +28,6 @@ from taojax.runtime.scale import rescale
 
 STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
 WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
-
-CPU_NUMBERS = 2000
-"""Branches times frames under one `vmap` on a CPU. Beyond that XLA compiles the sums to something
-several times slower per branch: 120 branches of 20 frames took three times as long as 100."""
 
 WARM_FRAMES = 3
 """Frames seen before anything is said of a place."""
@@ -72,8 +63,8 @@ class StreamState(eqx.Module):
     p: Float[Array, "n 2"]
     """Local positions of the window; the newest is the origin, so float32 stays exact."""
 
-    q: Float[Array, "n k 2"]
-    """Rank anchors."""
+    q: Float[Array, "n 2 k"]
+    """Rank anchors; branches innermost, as `branch_cost` wants them."""
 
     similarity: Float[Array, "n k"]
     has_anchor: Bool[Array, "n k"]
@@ -148,7 +139,7 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
     n, k = config.window, config.branches
     return StreamState(
         p=jnp.zeros((n, 2)),
-        q=jnp.zeros((n, k, 2)),
+        q=jnp.zeros((n, 2, k)),
         similarity=jnp.zeros((n, k)),
         has_anchor=jnp.zeros((n, k), bool),
         is_filled=jnp.zeros(n, bool),
@@ -203,18 +194,6 @@ def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array
     return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
 
 
-def _rank_costs(
-    params: CostParams, p: Float[Array, "n 2"], branches: Branch, weight: Float[Array, " n"]
-) -> BranchCost:
-    """Evaluate all rank branches, on a CPU a few at a time."""
-    n, k = p.shape[0], branches.q.shape[0]
-    at_once = max(1, CPU_NUMBERS // n) if jax.default_backend() == "cpu" else k
-    one = lambda branch: branch_cost(params, p, branch, weight)
-    return (
-        jax.vmap(one)(branches) if k <= at_once else jax.lax.map(one, branches, batch_size=at_once)
-    )
-
-
 @jax.jit
 def step(
     config: StreamConfig, tables: MapTables, state: StreamState, frame: Frame
@@ -238,39 +217,38 @@ def step(
     is_there = index >= 0
     anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
     p = _push(transform(inverse(odometry)[None], state.p), jnp.zeros(2))
-    q, s = _push(state.q, anchors), _push(state.similarity, similarity)
+    q, s = _push(state.q, anchors.T), _push(state.similarity, similarity)
     has_anchor = _push(state.has_anchor, is_there)
     is_filled = _push(state.is_filled, jnp.ones((), bool))
     filled = is_filled.astype(p.dtype)
-    weight = filled / jnp.sum(filled)
+    weight = filled / over_frames(filled)
 
     params = cost_params(config, tables)
-    branches = Branch(jnp.swapaxes(q, 0, 1), s.T, has_anchor.T)
-    costs = _rank_costs(params, p, branches, weight)
-    cheapest: BranchCost = jax.tree.map(lambda leaf: leaf[jnp.argmin(costs.total)], costs)
+    costs = branch_cost(params, p, Branch(jnp.swapaxes(q, 1, 2), s, has_anchor), weight)
+    cheapest = least(costs.total)
     # The signal is the minimum over all branches; a pose needs a candidate in the newest frame.
     has_candidates = jnp.any(is_there)
-    rank = jnp.argmin(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
-    best: BranchCost = jax.tree.map(lambda leaf: leaf[rank], costs)
-    shape = diagnose(p, q[:, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
+    rank = least(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
+    shape = diagnose(p, q[:, :, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
 
     n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *signals.WINDOWS))
     history = _push(state.top1, signals.top1(similarity))
-    previous = state.q[-1, 0]
+    previous = state.q[-1, :, 0]
     had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
-    windowed = {f"top1_w{n}": signals.windowed(history, n_seen, n) for n in signals.WINDOWS}
+    means = signals.windowed(history, n_seen)
+    windowed = {f"top1_w{n}": mean for n, mean in zip(signals.WINDOWS, means, strict=True)}
     rank_terms = {
-        "tao_rank": cheapest.total,
-        "tao_rank_geom": cheapest.geom,
-        "tao_rank_vel": cheapest.vel,
-        "tao_rank_sim": cheapest.sim,
+        "tao_rank": costs.total[cheapest],
+        "tao_rank_geom": costs.geom[cheapest],
+        "tao_rank_vel": costs.vel[cheapest],
+        "tao_rank_sim": costs.sim[cheapest],
     }
     if state.memory is None:
         memory = None
         terms = {name.replace("_rank", ""): value for name, value in rank_terms.items()}
         terms |= {name: terms["tao"] for name in ("tao_align", "tao_window", "tao_rival")}
         terms["recursive"] = signals.top1(similarity)
-        answer = rank_answer(best, is_filled, index[rank], has_candidates)
+        answer = rank_answer(costs, rank, is_filled, index[rank], has_candidates)
     else:
         memory, reading, terms = memory_step(
             config, tables, state.memory, odometry, index, similarity
@@ -300,11 +278,10 @@ def step(
 
     is_warm = n_seen >= WARM_FRAMES
     has_pose = answer.is_known & is_warm
-    status = jnp.select(
-        [~is_warm, ~has_candidates, answer.is_degenerate, answer.is_lost],
-        [WARMING_UP, NO_CANDIDATES, DEGENERATE, LOST],
-        OK,
-    )
+    status = jnp.where(answer.is_lost, LOST, OK)
+    status = jnp.where(answer.is_degenerate, DEGENERATE, status)
+    status = jnp.where(has_candidates, status, NO_CANDIDATES)
+    status = jnp.where(is_warm, status, WARMING_UP)
     record = StreamRecord(
         status=status,
         map_index=jnp.where(has_pose, answer.map_index, -1),

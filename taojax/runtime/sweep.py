@@ -117,11 +117,9 @@ def rank_signals(tables: MapTables, log: RankLog, unit: RankUnit) -> Float[Array
     def at(t: Array) -> Float[Array, " g"]:
         seen = (age < unit.window) & (age <= t)
         weight = seen.astype(jnp.float32)
-        cut = lambda leaf: jnp.swapaxes(jax.lax.dynamic_slice_in_dim(leaf, t, n), 0, 1)
+        cut = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, t, n)
         branches = Branch(cut(log.q), cut(log.similarity), cut(log.has_anchor))
-        costs = jax.vmap(branch_cost, in_axes=(None, None, 0, None))(
-            params, log.p[t], branches, weight / jnp.sum(weight)
-        )
+        costs = branch_cost(params, log.p[t], branches, weight / jnp.sum(weight))
         total = costs.geom[None] + costs.vel[None] + unit.gamma[:, None] * costs.sim[None]
         return jnp.min(jnp.where(is_branch, total, jnp.inf), axis=1)
 

@@ -40,14 +40,26 @@ class Audit(Common):
     scenario: Annotated[Scenario | None, flag("full|default|h3|h4", "all four")] = None
     """Run one scenario of the simulated world alone."""
 
+    simulate_views: bool = False
+    """DATASET is a plain folder with poses: simulate what it lacks, as `taojax convert folder`."""
+
+    map: Annotated[Path | None, flag("FOLDER", "DATASET holds it")] = None
+    """With --simulate-views: folder of the map drive, where DATASET is the query drive alone."""
+
 
 def run(args: Audit) -> None:
     """Audit a data folder or the simulated world."""
     if args.dataset is not None and args.scenario is not None:
         raise UsageError("--scenario names a part of the simulated world; drop it or DATASET")
+    if args.simulate_views and args.dataset is None:
+        raise UsageError("--simulate-views completes a DATASET; name one")
+    if args.map is not None and not args.simulate_views:
+        raise UsageError("--map goes with --simulate-views")
     config = config_of(args)
     out = out_of(args, "audit", config)
-    if args.dataset is not None:
+    if args.dataset is not None and args.simulate_views:
+        _audit_converted(args.dataset, args.map, out, config, progress=args.progress)
+    elif args.dataset is not None:
         _audit_folder(args.dataset, out, config, progress=args.progress)
     else:
         _audit_world(args.scenario, out, config, progress=args.progress)
@@ -61,6 +73,29 @@ def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool)
     if dataset.is_dir() and not truth.is_file():
         raise InputError(f"{truth}: no such file; add it, or run `taojax score` without truth")
     score_apart(dataset, out, config, progress=progress)
+    _judge(dataset, out, config)
+
+
+def _audit_converted(
+    dataset: Path, mapped: Path | None, out: Path, config: "Config", *, progress: bool
+) -> None:
+    """Complete a plain folder by simulation in out/data, then audit that."""
+    from taojax.records import refuse_if_taken
+    from taojax.verbs.convert import make
+    from taojax.verbs.convert_flags import Folder
+
+    refuse_if_taken(out)
+    data, scored = out / "data", out / "scored"
+    make(Folder(folder=dataset, out=data, map=mapped, simulate_views=True, seed=config.seed))
+    score_apart(data, scored, config, progress=progress)
+    # A run is published into an empty folder alone, and this one holds its data already.
+    for path in sorted(scored.iterdir(), key=lambda path: path.name == "manifest.json"):
+        path.rename(out / path.name)
+    scored.rmdir()
+    _judge(data, out, config)
+
+
+def _judge(dataset: Path, out: Path, config: "Config") -> None:
     from taojax.audit.evaluate import evaluate
 
     evaluation = evaluate(out, dataset / "truth", config)

@@ -1,0 +1,218 @@
+"""Retrieval lists and similarity matrices of a user's own frontend, for the frames that stay.
+
+    npz         index (T, K), similarity (T, K); -1 = no candidate
+    csv, txt    one row per query and candidate: `query,map,similarity` with a header, or hloc's
+                pairs `query map [score]`; names, or in a csv numbers of frames
+    npy         dense similarities (queries x map)
+
+Lists speak of the whole map: candidates that do not stay are dropped, the others renumbered.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from taojax.datasets.arrays import blocks, check_begin, check_kind, map_archive, map_npy
+from taojax.datasets.folder import Lists, Session
+from taojax.datasets.frame_names import Names
+from taojax.specs import fail, read_text
+from taojax.tables import read_table
+
+__all__ = ["N_BEST", "has_scores", "read_lists"]
+
+N_BEST = 100
+"""Candidates kept of a dense row, the paper's K."""
+
+LARGEST = 1.0 + 1e-3
+"""Rounding may lift a cosine so far."""
+
+FIX_SCALE = "similarities are at most 1: store cosines (1 - d^2 / 2 of unit descriptors) or rescale"
+FIX_ORDER = "store the best candidate first; larger = more alike, so turn distances round"
+
+
+def read_lists(
+    path: Path,
+    sessions: tuple[Session, Session],
+    kept: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " t"]],
+) -> Lists:
+    """Read what a frontend answered, for the frames that stay.
+
+    Args:
+        path: .npz, .csv, .txt or a dense .npy.
+        sessions: map and query before sub-sampling.
+        kept: rows of each session that stay.
+
+    Raises:
+        InputError: naming file, row and what to do.
+    """
+    check_begin(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return _from_matrix(path, sessions, kept)
+    if suffix == ".npz":
+        index, similarity = _from_archive(path, sessions)
+    elif suffix in (".csv", ".txt"):
+        index, similarity = _from_table(path, sessions)
+    else:
+        what = f"is no known file of retrieval lists ({suffix or 'no ending'})"
+        raise fail(path, what, "use .npz, .csv, .txt or a dense .npy; descriptors need two files")
+    return _for_kept(index[kept[1]], similarity[kept[1]], kept[0], len(sessions[0].frames))
+
+
+def _for_kept(index: np.ndarray, similarity: np.ndarray, kept: np.ndarray, n_map: int) -> Lists:
+    """Drop candidates that do not stay, renumber the others and close the gaps."""
+    # The last entry answers for -1, no candidate.
+    number = np.full(n_map + 1, -1, np.int64)
+    number[kept] = np.arange(len(kept))
+    index = number[index]
+    first = np.argsort(index < 0, axis=1, kind="stable")
+    width = max(1, int((index >= 0).sum(axis=1).max(initial=0)))
+    index = np.take_along_axis(index, first, axis=1)[:, :width]
+    similarity = np.take_along_axis(similarity, first, axis=1)[:, :width]
+    similarity = np.minimum(np.where(index >= 0, similarity, 0.0), 1.0)
+    return Lists(index.astype(np.int32), similarity.astype(np.float32))
+
+
+def _from_archive(
+    path: Path, sessions: tuple[Session, Session]
+) -> tuple[Int[np.ndarray, "t k"], Float[np.ndarray, "t k"]]:
+    """Read index and similarity of the whole sessions."""
+    arrays = map_archive(path, "retrievals")
+    index, similarity = (np.asarray(arrays[name]) for name in ("index", "similarity"))
+    check_kind(path, similarity.dtype)
+    n_map, n_query = (len(session.frames) for session in sessions)
+    if index.shape != similarity.shape:
+        what = f"index {index.shape} and similarity {similarity.shape} differ"
+        raise fail(path, what, "both are (T, K)")
+    if len(index) != n_query:
+        what = f"{len(index)} lists, but the whole query session has {n_query} frames"
+        raise fail(path, what, "give one list per frame, before sub-sampling")
+    index = index.astype(np.int64)
+    similarity = np.where(index == -1, 0.0, similarity.astype(np.float64))
+    running = np.minimum.accumulate(np.where(index >= 0, similarity, np.inf), axis=1)
+    rises = np.zeros(index.shape, dtype=bool)
+    rises[:, 1:] = (index[:, 1:] >= 0) & (similarity[:, 1:] > running[:, :-1] + 1e-6)
+    for is_bad, what, fix in (
+        ((index < -1) | (index >= n_map), "index", f"map rows are 0..{n_map - 1}, -1 = none"),
+        (~np.isfinite(similarity), "not finite", "use index -1 for no candidate"),
+        (similarity > LARGEST, "similarity", FIX_SCALE),
+        (rises, "similarity rises", FIX_ORDER),
+    ):
+        if is_bad.any():
+            row, rank = (int(at) for at in np.argwhere(is_bad)[0])
+            value = index[row, rank] if what == "index" else similarity[row, rank]
+            raise fail(path, f"row {row} (from 0), rank {rank}: {what} {value:g}", fix)
+    return index, similarity
+
+
+def has_scores(path: Path) -> bool:
+    """Tell whether a .csv or .txt of retrieval lists has a third column."""
+    lines = [line for line in read_text(path).splitlines() if not line.startswith("#")]
+    return len(lines[0].split("," if path.suffix.lower() == ".csv" else None)) == 3
+
+
+def _from_table(
+    path: Path, sessions: tuple[Session, Session]
+) -> tuple[Int[np.ndarray, "t k"], Float[np.ndarray, "t k"]]:
+    """Read one row per query and candidate; a query without row has no candidate."""
+    is_csv = path.suffix.lower() == ".csv"
+    table = read_table(path, "retrieval_list" if is_csv else "retrieval_pairs")
+    lines = _line_numbers(path, is_csv)
+    map_row, query_row = (
+        _rows_of(path, table[column], session, lines, column)
+        for column, session in zip(("map", "query"), sessions, strict=True)
+    )
+    order = np.argsort(query_row, kind="stable")
+    first = np.searchsorted(query_row[order], query_row[order], side="left")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - first
+    if "similarity" in table:
+        score = table["similarity"]
+        rises = (rank[order][1:] > 0) & (np.diff(score[order]) > 1e-6)
+        if rises.any():
+            line = lines[order[int(np.argmax(rises)) + 1]]
+            raise fail(path, f"row {line}: similarity rises down the list of a query", FIX_ORDER)
+    else:
+        score = 1.0 - rank / (rank.max() + 1)
+    shape = (len(sessions[1].frames), int(rank.max()) + 1)
+    index, similarity = np.full(shape, -1, np.int64), np.zeros(shape)
+    index[query_row, rank], similarity[query_row, rank] = map_row, score
+    return index, similarity
+
+
+def _line_numbers(path: Path, is_csv: bool) -> Int[np.ndarray, " n"]:
+    """Return the editor's line number of every data row."""
+    lines = enumerate(read_text(path).rstrip().splitlines(), start=1)
+    own = [number for number, line in lines if is_csv or not line.lstrip().startswith("#")]
+    return np.array(own[is_csv:])
+
+
+def _rows_of(
+    path: Path, cells: np.ndarray, session: Session, lines: np.ndarray, column: str
+) -> Int[np.ndarray, " n"]:
+    """Turn names, or numbers counted from 0, into rows of a session."""
+    n, names = len(session.frames), Names(session.frames)
+    found = {cell: names.find(cell) for cell in set(cells)}
+    named = np.array([found[cell][0] if len(found[cell]) == 1 else -1 for cell in cells])
+    is_number = all(cell.isascii() and cell.isdigit() for cell in found)
+    numbers = np.array([int(cell) for cell in cells]) if is_number else np.full(len(cells), -1)
+    if is_number and np.all(named < 0):
+        named = np.where(numbers < n, numbers, -1)
+    elif is_number and np.all(numbers < n) and np.any(named != numbers):
+        what = f"column {column}: the numbers may be names or rows of the session"
+        raise fail(path, what, "store whole image names")
+    if (wrong := np.flatnonzero(named < 0)).size:
+        cell = cells[int(wrong[0])]
+        several = len(found[cell]) > 1
+        what = f"{cell!r} fits {len(found[cell]) if several else 'none'} of the {n} frames"
+        where = f"row {lines[int(wrong[0])]}, column {column}"
+        raise fail(path, f"{where}: {what}", "store whole relative names, or numbers from 0")
+    return named
+
+
+def _from_matrix(
+    path: Path,
+    sessions: tuple[Session, Session],
+    kept: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " t"]],
+) -> Lists:
+    """Keep the best candidates of every row of a dense matrix, block by block."""
+    matrix = map_npy(path, "similarity")
+    whole = (len(sessions[1].frames), len(sessions[0].frames))
+    if matrix.shape == whole:
+        columns, rows = kept
+    elif matrix.shape == (len(kept[1]), len(kept[0])):
+        columns, rows = np.arange(matrix.shape[1]), np.arange(matrix.shape[0])
+    else:
+        what = f"shape {matrix.shape}, but there are {whole[0]} query and {whole[1]} map frames"
+        fix = "transpose it" if matrix.shape == whole[::-1] else (
+            "give similarities of the whole sessions (queries x map), or descriptors of both"
+        )  # fmt: skip
+        raise fail(path, what, fix)
+    index = np.empty((len(rows), min(N_BEST, len(columns))), np.int32)
+    similarity = np.empty(index.shape, np.float32)
+    done = 0
+    for some in blocks(rows, 8 * matrix.shape[1]):
+        with np.errstate(invalid="ignore"):
+            part = np.asarray(matrix[some], np.float64)[:, columns]
+        _check_matrix(path, part, some, columns)
+        best = np.argpartition(-part, index.shape[1] - 1, axis=1)[:, : index.shape[1]]
+        # By map row first, so that of equals the earlier one leads.
+        best.sort(axis=1)
+        values = np.take_along_axis(part, best, axis=1)
+        order = np.argsort(-values, axis=1, kind="stable")
+        index[done : done + len(some)] = np.take_along_axis(best, order, axis=1)
+        similarity[done : done + len(some)] = np.take_along_axis(values, order, axis=1)
+        done += len(some)
+    return Lists(index, np.minimum(similarity, 1.0))
+
+
+def _check_matrix(path: Path, part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> None:
+    for is_bad, what, fix in (
+        (~np.isfinite(part), "not finite", "compute it again"),
+        (part > LARGEST, "larger than 1", FIX_SCALE),
+    ):
+        if is_bad.any():
+            row, column = (int(at) for at in np.argwhere(is_bad)[0])
+            where = f"row {rows[row]}, column {columns[column]} (from 0)"
+            raise fail(path, f"{where}: {part[row, column]:g} is {what}", fix)

@@ -1,0 +1,199 @@
+"""Relative odometry for a converted data set: from files, or simulated and said to be.
+
+Every source becomes a drive in its own frame; the motion between two frames is read off that drive
+at their stamps. So sources of any rate fit frames of any rate.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from taojax.datasets.rosbag import read_bag
+from taojax.datasets.simulate import simulated_odometry
+from taojax.datasets.trajectories import (
+    Plane,
+    check_seconds,
+    read_trajectory,
+    row_of,
+    stamps_s,
+)
+from taojax.datasets.trajectory import Trajectory, integrate, motions, pose_at
+from taojax.datasets.wheels import read_wheels
+from taojax.datasets.world import WorldConfig
+from taojax.errors import InputError
+from taojax.specs import fail
+from taojax.tables import read_table
+
+__all__ = ["OdometryKind", "odometry_at", "read_odometry", "simulated"]
+
+OdometryKind = Literal[
+    "tum", "kitti", "euroc", "g2o", "csv", "steps", "wheels", "bag", "robotcar-vo"
+]
+"""What holds the odometry; the first five as in `trajectories.Kind`."""
+
+LEAST_COVERED = 0.5
+"""Odometry that covers a smaller share of the frames belongs to another drive."""
+
+
+def read_odometry(
+    path: Path,
+    kind: OdometryKind,
+    *,
+    times: Path | None = None,
+    plane: Plane | None = None,
+    topic: str | None = None,
+) -> Trajectory:
+    """Read odometry as a drive in its own frame.
+
+    Args:
+        path: a file; a sequence folder for `wheels`; a file or folder for `bag`.
+        kind: a file of poses (see `read_trajectory`), `steps` (the contract's
+            query/odometry.csv), `wheels` (Complex Urban counters and gyro), `bag` (ROS 1 or 2)
+            or `robotcar-vo` (vo/vo.csv).
+        times: stamp of every KITTI frame [s].
+        plane: how 3-D poses are laid flat; without it `xz` for KITTI and `xy` for the others.
+            Kinds that are planar by themselves do not ask it.
+        topic: of a bag that has several with poses.
+
+    Returns:
+        At least two stamped poses.
+
+    Raises:
+        InputError: naming file, row and fix.
+        MissingExtraError: a bag, and rosbags is not installed.
+    """
+    if times is not None and kind != "kitti":
+        raise fail(times, f"odometry of kind {kind} has its own stamps", "leave the times away")
+    if topic is not None and kind != "bag":
+        raise fail(path, f"odometry of kind {kind} has no topics", "leave the topic away")
+    if kind == "steps":
+        return _read_steps(path)
+    if kind == "wheels":
+        return read_wheels(path)
+    if kind == "bag":
+        return read_bag(path, topic=topic, plane=plane or "xy")
+    if kind == "robotcar-vo":
+        return _read_robotcar_vo(path)
+    return read_trajectory(path, kind, times=times, plane=plane)
+
+
+def odometry_at(
+    source: Trajectory, t_s: Float[np.ndarray, " t"], gate_s: float
+) -> tuple[Float[np.ndarray, "t 3"], str | None]:
+    """Read the motion between frames off a drive.
+
+    Args:
+        source: the drive, in any frame.
+        t_s: (T,) stamps of the frames on the same clock, rising.
+        gate_s: a frame farther than this from every pose of the drive is not covered by it.
+
+    Returns:
+        (T, 3) forward [m], left [m], yaw [rad] since the frame before, row 0 zero; and a sentence
+        for the report where frames are not covered (they have the pose nearest in time, so that
+        the robot seems to wait there), else None.
+
+    Raises:
+        InputError: less than half of the frames are covered; it names the share, both ranges of
+            time and the unit that would explain it.
+    """
+    poses, is_covered = pose_at(source, t_s, gate_s)
+    share, n_out = float(is_covered.mean()), int((~is_covered).sum())
+    if share < LEAST_COVERED:
+        raise InputError(
+            f"odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: frames run "
+            f"from {t_s[0]:.3f} to {t_s[-1]:.3f} s, odometry from {source.t_s[0]:.3f} to "
+            f"{source.t_s[-1]:.3f} s; {_clock_fix(source.t_s, t_s)}"
+        )
+    note = None
+    if n_out:
+        note = (
+            f"odometry: {n_out} of {len(t_s)} frames are more than {gate_s:g} s from any of its "
+            "poses and have the nearest one, so that the robot seems to wait there"
+        )
+    return motions(poses), note
+
+
+def simulated(xyt: Float[np.ndarray, "t 3"], seed: int) -> tuple[Float[np.ndarray, "t 3"], str]:
+    """Simulate odometry from poses, for a data set that has none.
+
+    Args:
+        xyt: (T, 3) poses of the frames.
+        seed: of the noise.
+
+    Returns:
+        (T, 3) forward [m], left [m], yaw [rad], row 0 zero; and the sentence for the report.
+
+    Raises:
+        InputError: the seed is negative.
+    """
+    if seed < 0:
+        raise InputError(f"seed {seed}: must not be negative")
+    knobs = WorldConfig()
+    note = (
+        f"simulated odometry: true motions with a scale error of {knobs.odometry_scale:.1%}, a yaw "
+        f"error of {knobs.odometry_yaw_rad_per_m:g} rad per metre and white noise of "
+        f"{knobs.odometry_m:g} m and {knobs.odometry_rad:g} rad per root of a metre, seed {seed}"
+    )
+    return simulated_odometry(xyt, knobs, seed), note
+
+
+def _clock_fix(source_s: np.ndarray, t_s: np.ndarray) -> str:
+    """Say what would bring two clocks together: a unit, a shift or a wider gate."""
+    # A slip of unit shows in how long the drives last and in how late they are, alike.
+    powers = {
+        round(np.log10(own / other) / 3.0) if own > 0 and other > 0 else 0
+        for own, other in (
+            (np.ptp(source_s), np.ptp(t_s)),
+            (np.median(np.abs(source_s)), np.median(np.abs(t_s))),
+        )
+    }
+    power = powers.pop() if len(powers) == 1 else 0
+    if power:
+        larger = "odometry" if power > 0 else "frames"
+        return f"the stamps of the {larger} look 1e{3 * abs(power)} times too large: use seconds"
+    if source_s[0] <= t_s[-1] and t_s[0] <= source_s[-1]:
+        return "use denser odometry, a wider gate, or odometry of the whole drive"
+    return "give both the same clock, and odometry of the same drive"
+
+
+def _read_steps(path: Path) -> Trajectory:
+    table = read_table(path, "odometry_steps")
+    t_s, *steps = table.values()
+    check_seconds(path, t_s, partial(row_of, path, len(t_s)))
+    return Trajectory(t_s, integrate(np.stack(steps, axis=1)))
+
+
+def _read_robotcar_vo(path: Path) -> Trajectory:
+    """Chain relative poses, each from its earlier to its later stamp, in either order of rows.
+
+    Source:
+        Maddern et al., IJRR 36(1), 2017: x forward, y right, z down. The data set's own code takes
+        a row's pose as the motion up to its source stamp, which is the later one.
+    """
+    table = read_table(path, "robotcar_vo")
+    n = len(table["x"])
+    rows = np.arange(n)
+    where = lambda index: row_of(path, n, int(rows[index]))
+    stamps = np.stack([table["source_timestamp"], table["destination_timestamp"]], axis=1)
+    step_us = stamps[:, 0] - stamps[:, 1]
+    is_odd = (step_us == 0) | (np.sign(step_us) != np.sign(step_us[0]))
+    if (odd := np.flatnonzero(is_odd)).size:
+        what = f"{where(int(odd[0]))}: its two stamps are the same, or in another order than before"
+        raise fail(path, what, "every row joins two stamps, the later one always in one column")
+    motion = np.stack([table["x"], -table["y"], -table["yaw"]], axis=1)
+    if stamps[0, 0] > stamps[-1, 0]:
+        stamps, motion, rows = stamps[::-1], motion[::-1], rows[::-1]
+    before, behind = stamps.min(axis=1), stamps.max(axis=1)
+    if (odd := np.flatnonzero(before[1:] != behind[:-1])).size:
+        at = int(odd[0])
+        what = f"{where(at + 1)}: begins at {before[at + 1]}, but {where(at)} ends at {behind[at]}"
+        raise fail(path, what, "the rows must chain in time: sort them, or cut the file there")
+    if motion[:, 0].sum() < -1.0:
+        what = f"the motions lead {-motion[:, 0].sum():.0f} m backwards in all"
+        raise fail(path, what, "the poses look inverted: give those of the later stamp")
+    every_us = np.concatenate([before[:1], behind])
+    t_s = stamps_s(path, every_us, "microseconds", lambda index: where(max(index - 1, 0)))
+    return Trajectory(t_s, integrate(np.concatenate([np.zeros((1, 3)), motion])))

@@ -1,0 +1,204 @@
+"""`taojax convert`: public data sets and users' own folders as data folders."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from taojax.errors import UsageError
+from taojax.verbs.common import say
+from taojax.verbs.convert_flags import (
+    ComplexUrban,
+    Convert,
+    Folder,
+    Kri,
+    Mulran,
+    Pair,
+    Robotcar,
+    Sthereo,
+    Vivid,
+)
+
+if TYPE_CHECKING:
+    from taojax.datasets.convert import Choices, Motion
+    from taojax.datasets.folder import Session
+    from taojax.datasets.sessions import Matching
+
+    Sessions = tuple[Session, Session]
+
+__all__ = ["Convert", "make", "run"]
+
+
+def run(args: Convert) -> None:
+    """Make the data folder and say what comes next."""
+    out = args.data.out
+    make(args.data)
+    say(f"wrote {out}; next: taojax inspect {out}, then taojax audit {out}")
+
+
+def make(data: Pair | Folder) -> None:
+    """Read the sessions, make the data folder and say what was found.
+
+    Args:
+        data: the flags of one data set.
+    """
+    choices = _choices(data)
+    from taojax.datasets.convert import make_folder
+
+    sessions = _READ[type(data)](data, _matching(data))
+    made = make_folder(data.out, sessions, choices)
+    for side, n, way_m in zip(("map", "query"), made.n_frames, made.way_m, strict=True):
+        say(f"{side}: {n:,} frames, {way_m:,.0f} m of way")
+    for note in made.notes:
+        say(f"note: {note}")
+
+
+def _check_flags(data: Pair | Folder) -> None:
+    """Refuse flags that contradict each other or ask for nothing."""
+    if data.simulate_views and (data.map_views or data.query_views):
+        raise UsageError("--simulate-views replaces --map-views and --query-views; drop one")
+    if data.query_views is not None and data.map_views is None:
+        raise UsageError("--query-views goes with --map-views")
+    if data.spacing_m is not None and (data.map_frames or data.query_frames):
+        raise UsageError("--spacing-m chooses frames by metres; drop it or the numbers of frames")
+    for name in ("map_frames", "query_frames", "spacing_m", "gate_s"):
+        value = getattr(data, name)
+        if value is not None and not value > 0:
+            raise UsageError(f"--{name.replace('_', '-')} {value} must be positive")
+    if not 0 <= data.least_matched <= 1:
+        raise UsageError(f"--least-matched {data.least_matched} is a share from 0 to 1")
+    if data.seed < 0:
+        raise UsageError(f"--seed {data.seed} must not be negative")
+    for name in ("odometry_kind", "times", "plane", "topic"):
+        if data.odometry is None and getattr(data, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} goes with --odometry")
+
+
+def _motion(data: Pair | Folder) -> "Motion | None":
+    """Return the odometry that was asked for, else the data set's own, if any."""
+    from taojax.datasets.convert import Motion, recorded_odometry
+
+    if data.odometry is None:
+        return recorded_odometry(data.folder if isinstance(data, Folder) else data.query)
+    kind = data.odometry_kind or ("bag" if data.odometry.suffix == ".bag" else None)
+    if kind is None:
+        raise UsageError("--odometry needs --odometry-kind: a format is not guessed")
+    return Motion(data.odometry, kind, data.times, data.plane, data.topic)
+
+
+def _views(data: Pair | Folder) -> "tuple[Path, Path | None] | None":
+    """Return the files of descriptors or lists; None: they are simulated."""
+    from taojax.datasets.convert import recorded_views
+
+    if data.simulate_views:
+        return None
+    if data.map_views is not None:
+        return data.map_views, data.query_views
+    own = recorded_views(data.folder, data.map) if isinstance(data, Folder) else None
+    if own is None:
+        raise UsageError(
+            "what do the frames look like? Give --map-views and --query-views, or --simulate-views"
+        )
+    return own
+
+
+def _choices(data: Pair | Folder) -> "Choices":
+    _check_flags(data)
+    views = _views(data)
+    from taojax.datasets.convert import N_MAP, N_QUERY, Choices
+
+    # The rows of a plain folder are what its owner chose already.
+    usual = (None, None) if isinstance(data, Folder) else (N_MAP, N_QUERY)
+    return Choices(
+        n_map=data.map_frames or usual[0],
+        n_query=data.query_frames or usual[1],
+        spacing_m=data.spacing_m,
+        gate_s=data.gate_s,
+        motion=_motion(data),
+        views=views,
+        seed=data.seed,
+    )
+
+
+def _matching(data: Pair | Folder) -> "Matching":
+    from taojax.datasets.sessions import Matching
+
+    return Matching(data.gate_s, data.pose == "interpolated", data.least_matched)
+
+
+def _sthereo(data: Sthereo, matching: "Matching") -> "Sessions":
+    from taojax.datasets.sthereo import check_sensors, read_sthereo
+
+    is_local = data.poses == "local"
+    mapped, query = (
+        read_sthereo(source, camera=data.camera, is_local=is_local, matching=matching)
+        for source in (data.map, data.query)
+    )
+    for source in (data.map, data.query):
+        if sound := check_sensors(source):
+            say(f"{source}: checked against their specs: {', '.join(sound)}")
+    return mapped, query
+
+
+def _kri(data: Kri, matching: "Matching") -> "Sessions":
+    from taojax.datasets.convert import N_MAP
+    from taojax.datasets.kri import read_kri
+
+    read = partial(read_kri, camera=data.camera, variant=data.variant, route_m=data.route_m)
+    # The unit is a row of the map that is made, not of the sequence it is thinned from.
+    n_rows = min(len(read(data.map).frames), data.map_frames or N_MAP)
+    return read(data.map, n_rows=n_rows), read(data.query, n_rows=n_rows)
+
+
+def _mulran(data: Mulran, matching: "Matching") -> "Sessions":
+    from taojax.datasets.mulran import read_mulran
+
+    read = partial(read_mulran, frames=data.frames, matching=matching)
+    return read(data.map), read(data.query)
+
+
+def _complex_urban(data: ComplexUrban, matching: "Matching") -> "Sessions":
+    from taojax.datasets.mulran import read_complex_urban
+
+    read = partial(read_complex_urban, frames=data.frames, matching=matching)
+    return read(data.map), read(data.query)
+
+
+def _robotcar(data: Robotcar, matching: "Matching") -> "Sessions":
+    from taojax.datasets.robotcar import read_robotcar
+
+    read = partial(read_robotcar, camera=data.camera, gps=data.gps, matching=matching)
+    return read(data.map), read(data.query)
+
+
+def _vivid(data: Vivid, matching: "Matching") -> "Sessions":
+    from taojax.datasets.vivid import read_vivid
+
+    read = partial(read_vivid, images=data.images, matching=matching)
+    return read(data.map), read(data.query)
+
+
+def _folder(data: Folder, matching: "Matching") -> "Sessions":
+    from taojax.datasets.convert import notes_of
+    from taojax.datasets.plain import read_plain, read_traverse
+
+    if data.map is None and (data.folder / "poses.csv").is_file():
+        raise UsageError(f"{data.folder} is one drive: name the folder of the map drive with --map")
+    if data.map is None:
+        mapped, query = read_plain(data.folder)
+    else:
+        mapped, query = read_traverse(data.map)[0], read_traverse(data.folder)[0]
+    said = (*query.notes, *notes_of(data.folder))
+    return mapped, dataclasses.replace(query, notes=said)
+
+
+_READ: dict[type, Callable[[Any, "Matching"], "Sessions"]] = {
+    Sthereo: _sthereo,
+    Kri: _kri,
+    Mulran: _mulran,
+    ComplexUrban: _complex_urban,
+    Robotcar: _robotcar,
+    Vivid: _vivid,
+    Folder: _folder,
+}

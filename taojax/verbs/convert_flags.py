@@ -1,0 +1,191 @@
+"""Flags of `taojax convert`, one class per data set."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from taojax.verbs.common import flag
+
+Kind = Literal["tum", "kitti", "euroc", "g2o", "csv", "steps", "wheels", "bag", "robotcar-vo"]
+
+
+def _place(metavar: str) -> Any:
+    return tyro.conf.arg(metavar=metavar)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Making:
+    """Flags of every data set."""
+
+    map_frames: Annotated[int | None, flag("N", "2000; of a plain folder, all")] = None
+    """Map frames to keep, evenly by number."""
+
+    query_frames: Annotated[int | None, flag("N", "1000; of a plain folder, all")] = None
+    """Query frames to keep, evenly by number."""
+
+    spacing_m: Annotated[float | None, flag("M", "by number")] = None
+    """Keep a frame every so many metres of way instead; standing frames then count once."""
+
+    gate_s: float = 0.5
+    """A pose or odometry farther than this from a frame in time is none, seconds."""
+
+    pose: Literal["interpolated", "nearest"] = "interpolated"
+    """Whether a frame lies between the poses around it or at the nearest."""
+
+    least_matched: float = 0.5
+    """Refuse a session where a smaller share of the frames has a pose."""
+
+    odometry: Annotated[Path | None, flag("FILE", "the set's own, else simulated")] = None
+    """Odometry of the query session."""
+
+    odometry_kind: Annotated[Kind | None, flag("KIND", "bag for a .bag, else to be given")] = None
+    """Its format: tum, kitti, euroc, g2o, csv (stamped poses), steps (as query/odometry.csv),
+    wheels (a Complex Urban folder), bag or robotcar-vo."""
+
+    times: Annotated[Path | None, flag("FILE", "none")] = None
+    """Stamps of odometry without any (kitti)."""
+
+    plane: Annotated[Literal["xz", "xy"] | None, flag("xz|xy", "as the kind has it")] = None
+    """Axes of the ground in 3-D odometry: xz for cameras, xy where z is up."""
+
+    topic: Annotated[str | None, flag("NAME", "the only one")] = None
+    """Odometry topic of a bag."""
+
+    map_views: Annotated[Path | None, flag("FILE", "none")] = None
+    """Descriptors of the map images (npy, npz, h5); or, without --query-views, one file that
+    answers for both: retrieval lists (npz, csv), a similarity matrix (npy), an hloc h5."""
+
+    query_views: Annotated[Path | None, flag("FILE", "none")] = None
+    """Descriptors of the query images."""
+
+    simulate_views: bool = False
+    """Simulate the descriptors of both sessions from their poses; the report says so."""
+
+    seed: int = 0
+    """Of everything that is simulated."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair(Making):
+    """Two recorded sequences and the data folder they become."""
+
+    map: Annotated[Path, tyro.conf.Positional, _place("MAP")]
+    """Sequence that becomes the map."""
+
+    query: Annotated[Path, tyro.conf.Positional, _place("QUERY")]
+    """Sequence that asks where it is."""
+
+    out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
+    """Data folder to make."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sthereo(Pair):
+    """STheReO: two folders with image/ and pose/, or two frame lists.
+
+    Example: taojax convert sthereo kaist_morning kaist_evening OUT --simulate-views
+    """
+
+    camera: str = "stereo_thermal_14_left"
+    """Folder below image/ whose files are the frames."""
+
+    poses: Literal["global", "local"] = "global"
+    """pose/global_pose.csv in UTM, or pose/local_pose.csv."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kri(Pair):
+    """NUFR-KRI: image sequences without poses; the position is the progress along the route.
+
+    Example: taojax convert kri kri_day_2 kri_night OUT --map-views day.npy --query-views night.npy
+    """
+
+    camera: str = "cam_3"
+    """Folder of the camera."""
+
+    variant: str = "matlab_clahe2"
+    """Folder of the prepared images below it."""
+
+    route_m: Annotated[float | None, flag("M", "the unit is a row of the map")] = None
+    """Length of the route, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mulran(Pair):
+    """MulRan: two folders with global_pose.csv.
+
+    Example: taojax convert mulran KAIST01 KAIST02 OUT --simulate-views
+    """
+
+    frames: Annotated[str | None, flag("SUBFOLDER", "lidar, radar or the poses themselves")] = None
+    """Folder whose files, named by their stamp, are the frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ComplexUrban(Pair):
+    """KAIST Complex Urban: two folders with global_pose.csv; wheels and gyro are the odometry.
+
+    Example: taojax convert complex-urban urban28 urban38 OUT --simulate-views
+    """
+
+    frames: Annotated[str | None, flag("SUBFOLDER", "left camera or the poses themselves")] = None
+    """Folder whose files, named by their stamp, are the frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Robotcar(Pair):
+    """Oxford RobotCar: two traverses with gps/; vo/vo.csv is the odometry.
+
+    Example: taojax convert robotcar 2014-07-14-14-49-50 2015-05-19-14-06-38 OUT --simulate-views
+    """
+
+    camera: str = "stereo/centre"
+    """Folder of the images; or its list stereo.timestamps."""
+
+    gps: Literal["ins", "rtk"] = "ins"
+    """gps/ins.csv or gps/rtk.csv."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Vivid(Pair):
+    """ViViD++: two driving sequences with gpslist.txt or thermal_gps_framelist.txt.
+
+    Example: taojax convert vivid campus_day1 campus_night OUT --simulate-views
+    """
+
+    images: str = "img/thermal_fieldscale_clahe"
+    """Folder whose files, named by their time in seconds, are the frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Folder(Making):
+    """A folder of your own with poses; or, with --map, two folders of one drive each.
+
+    Example: taojax convert folder my_recording OUT --map-views map.npy --query-views query.npy
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional, _place("FOLDER")]
+    """Folder with map/ and query/ or truth/; with --map, of the query drive: poses.csv and, where
+    it is known, odometry.csv."""
+
+    out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
+    """Data folder to make."""
+
+    map: Annotated[Path | None, flag("FOLDER", "FOLDER holds both")] = None
+    """Folder of the map drive: poses.csv."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Make a data folder of a public data set or of your own recordings.
+
+    Example: taojax convert sthereo kaist_morning kaist_evening OUT --simulate-views
+    """
+
+    data: Annotated[
+        Sthereo | Kri | Mulran | ComplexUrban | Robotcar | Vivid | Folder,
+        tyro.conf.OmitSubcommandPrefixes,
+        tyro.conf.OmitArgPrefixes,
+    ]

@@ -1,0 +1,93 @@
+"""`taojax inspect`: what a data folder holds, and what can be expected of it, before a long run."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from taojax.errors import InputError
+from taojax.verbs.common import Dataset
+
+if TYPE_CHECKING:
+    from taojax.audit.truth import Truth
+    from taojax.runtime.checkup import Found
+
+LEAST_MATCHED = 0.5
+"""Share of query stamps that the truth has to know."""
+
+TRUTH = "truth/query_poses.csv"
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspect:
+    """Look at a data folder before a long run: what is there, what is wrong, what to expect.
+
+    Example: taojax inspect my_data
+    """
+
+    dataset: Dataset = tyro.MISSING
+    """Data folder, laid out as data_specs/README.md says; truth/ is read where it is there."""
+
+    anyway: bool = False
+    """Do not refuse where the truth knows less than half of the query stamps."""
+
+
+def run(args: Inspect) -> None:
+    """Print what was found; refuse a folder that cannot be scored or judged."""
+    from taojax.runtime.checkup import check
+    from taojax.verbs import inspect_page as tell
+    from taojax.verbs.inspect_views import lengths, likeness
+
+    found = check(args.dataset)
+    truth = _read_truth(args.dataset, found)
+    page = tell.Page([str(args.dataset)])
+    tell.files(page, found, has_truth=truth is not None or TRUTH in found.problems)
+    matched = tell.clocks(page, found, truth)
+    shape = tell.drive(page, found)
+    tell.odometry(page, found, truth, shape)
+    lengths(page, found)
+    if shape is not None:
+        likeness(page, found, truth, shape)
+    refusal = _refusal(found, None if args.anyway else matched)
+    verb = "score" if truth is None else "audit"
+    page.end(f"refused: {refusal}" if refusal else f"ready for taojax {verb} {args.dataset}")
+    print("\n".join(page.lines))
+    if refusal:
+        raise InputError(f"{args.dataset}: {refusal}")
+
+
+def _read_truth(folder: Path, found: "Found") -> "Truth | None":
+    """Read the truth where there is one; what is wrong with it is a problem like any other."""
+    from taojax.audit.truth import read_truth
+
+    path = folder / TRUTH
+    if not path.exists():
+        return None
+
+    truth = found.attempt(TRUTH, lambda: read_truth(path, _n_rows(path)))
+    if truth is not None:
+        found.files[TRUTH] = f"{len(truth.t_s):,} rows"
+        if (t := found.query_t) is not None:
+            found.attempt(TRUTH, lambda: read_truth(path, len(t)))
+    return truth
+
+
+def _n_rows(path: Path) -> int:
+    """Return how many poses a file seems to hold: its clock is of use even where that is wrong."""
+    from taojax.specs import read_text
+
+    return len(read_text(path).rstrip().splitlines()) - 1
+
+
+def _refusal(found: "Found", matched: float | None) -> str:
+    """Return why the folder is refused, blank where it is not."""
+    if found.problems:
+        names = ", ".join(found.problems)
+        return f"{len(found.problems)} problem(s): {names}; mend them and inspect again"
+    if matched is not None and matched < LEAST_MATCHED:
+        return (
+            f"the truth knows {100 * matched:.0f} % of the query stamps; give both files one clock,"
+            " or add --anyway"
+        )
+    return ""
