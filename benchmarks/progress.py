@@ -151,12 +151,11 @@ def measure(route: Route, settings: ProgressConfig, seed: int, config: Config) -
     others = {entry.name: entry.signal for entry in said}
     splits = _cut(judgement, others | {tables.FUSED: _single_view(judgement)})
     beside = tables.metrics_table(others, judgement.label, splits, config.audit, config.seed)
-    found = {tables.FUSED: "joint"}, {tables.FUSED: "single_view"}
     rows = {}
-    for table, renamed in zip((judgement.metrics, beside), found, strict=True):
+    for table, fused in ((judgement.metrics, "joint"), (beside, "single_view")):
         for at, signal in enumerate(table["signal"]):
             row = {column: values[at] for column, values in table.items()}
-            rows[renamed.get(signal, signal)] = row
+            rows[fused if signal == tables.FUSED else signal] = row
     n_anchors = settings.n_anchors or len(route.map_rows)
     own = {"n_anchors": n_anchors, "row_m": settings.row_m, "seed": seed}
     return [rows[method] | own | {"method": method} for method in TITLES]
@@ -214,7 +213,7 @@ def _unit(rows: Sequence[Row]) -> str:
     ]
     return (
         f"With {OTHER_ROW_M:g} m instead of 1 per row (first seed, all anchors, radii along) no "
-        f"AUROC and no FAR of ours changes by more than {np.nanmax(gaps):.4f}.\n"
+        f"AUROC and no FAR of ours changes by more than {max(1e-4, np.nanmax(gaps)):.4f}.\n"
     )
 
 

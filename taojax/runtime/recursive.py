@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from taojax.core.association import AnchorGrid, look_up
 from taojax.core.se2 import rotate
-from taojax.core.sums import least, over_frames
+from taojax.core.sums import least
 from taojax.runtime.maps import MapTables
 
 EVIDENCE = 8.0
@@ -109,7 +109,7 @@ def recursive_step(
     direction = jnp.array([[0], [1]])
     arriving = spread[jnp.where(is_same, direction, 1 - direction), known]
     arriving = jnp.where(is_linked, (1.0 - LEAK) * arriving, 0.0)
-    gone = jnp.maximum(1.0 - state.off - _total(arriving), 0.0)
+    gone = jnp.maximum(1.0 - state.off - jnp.sum(arriving), 0.0)
     off = STAY_OFF * state.off + gone
     mass = arriving + (1.0 - STAY_OFF) * state.off / (2 * m)
 
@@ -117,13 +117,8 @@ def recursive_step(
     listed = jnp.where(index >= 0, index, m)
     evidence = jnp.ones(m).at[listed].set(jnp.exp(EVIDENCE * scaled), mode="drop")
     mass = mass * evidence[None]
-    total = _total(mass) + off
+    total = jnp.sum(mass) + off
     mass, off = mass / total, off / total
     here = least(-(mass[0] + mass[1]))
     is_local = (x - x[here]) ** 2 + (y - y[here]) ** 2 < (LOCAL_SPACINGS * spacing_m) ** 2
-    return RecursiveState(mass, off), 1.0 - _total(jnp.where(is_local[None], mass, 0.0))
-
-
-def _total(mass: Float[Array, "2 m"]) -> Float[Array, ""]:
-    facing, other = over_frames(mass.T)
-    return facing + other
+    return RecursiveState(mass, off), 1.0 - jnp.sum(jnp.where(is_local[None], mass, 0.0))
