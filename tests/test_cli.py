@@ -11,7 +11,10 @@ from taojax.cli import main
 from taojax.records import signal_names
 
 FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
-VERBS = ("audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export")
+VERBS = (
+    "audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export", "convert",
+    "inspect",
+)  # fmt: skip
 
 
 def fails(capsys, code, *words):
@@ -52,6 +55,7 @@ def test_score_seals_a_run_with_every_column(data_folder, tmp_path):
         "manifest.json",
         "config.toml",
         "map_poses.csv",
+        "odometry.csv",
         "retrievals.npz",
         "signals.csv",
     }

@@ -1,6 +1,5 @@
 """From two sessions of any data set to one data folder: frames, odometry, views."""
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,19 +10,16 @@ from jaxtyping import Float, Int
 from taojax.datasets.descriptors import read_views, view_notes
 from taojax.datasets.folder import Descriptors, Lists, Session, write_folder
 from taojax.datasets.odometry import OdometryKind, odometry_at, read_odometry, simulated
-from taojax.datasets.sessions import Listed
 from taojax.datasets.simulate import WorldConfig, describe_routes
 from taojax.datasets.trajectories import Plane
 from taojax.datasets.trajectory import Trajectory, driven_m, every, spaced
 from taojax.errors import InputError
-from taojax.specs import fail, read_text
 
 __all__ = [
     "Choices",
     "Made",
     "Motion",
     "make_folder",
-    "notes_of",
     "recorded_odometry",
     "recorded_views",
 ]
@@ -36,7 +32,6 @@ LEAST_FRAMES = 3
 
 FAR_M = 1e5
 """Where coordinates of the map frame end; beyond, float32 loses centimetres."""
-
 
 WHEELS = "sensor_data/encoder.csv", "sensor_data/fog.csv", "calibration/EncoderParameter.txt"
 
@@ -132,25 +127,6 @@ def recorded_views(folder: Path, mapped: Path | None = None) -> tuple[Path, Path
     if mapped is not None:
         pairs = [(mapped / "descriptors.npy", folder / "descriptors.npy")]
     return next((pair for pair in pairs if all(p is None or p.is_file() for p in pair)), None)
-
-
-def notes_of(folder: Path) -> tuple[str, ...]:
-    """Return what a folder says of itself in about.toml, so that it is not lost on the way.
-
-    Args:
-        folder: plain or of one drive; it may have no about.toml.
-
-    Raises:
-        InputError: the file is not TOML.
-    """
-    path = folder / "about.toml"
-    if not path.is_file():
-        return ()
-    try:
-        notes = tomllib.loads(read_text(path)).get("notes", [])
-    except tomllib.TOMLDecodeError as error:
-        raise fail(path, f"is not TOML ({error})", "expected notes = [...]") from error
-    return tuple(str(note) for note in ([notes] if isinstance(notes, str) else notes))
 
 
 def make_folder(out: Path, sessions: tuple[Session, Session], choices: Choices) -> Made:
@@ -258,7 +234,7 @@ def _with_all(
     session: Session, kept: Int[np.ndarray, " k"]
 ) -> tuple[Session, Int[np.ndarray, " k"]]:
     """Return a session of all images, also those without a pose, and the kept ones' rows in it."""
-    if not isinstance(session, Listed) or len(session.listed) == len(session.frames):
+    if len(session.listed) in (0, len(session.frames)):
         return session, kept
     row_of = {name: row for row, name in enumerate(session.listed)}
     rows = np.array([row_of[session.frames[row]] for row in kept], np.int64)

@@ -39,6 +39,9 @@ class Session:
     notes: tuple[str, ...] = ()
     """Sentences that the report must repeat: frames left out, simulated parts, choices made."""
 
+    listed: tuple[str, ...] = ()
+    """Names of all images, where some have no pose: descriptors are made before anybody knows."""
+
 
 @dataclass(frozen=True)
 class Descriptors:

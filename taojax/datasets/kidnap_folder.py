@@ -1,17 +1,17 @@
 """Kidnap logs on disk: read a world or a data folder as source, write logs as a data folder."""
 
 import json
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from taojax.about import read_about
 from taojax.datasets.kidnap import LEVELS, TRIAL_FRAMES, WINDOW_FRAMES, Log, Source
 from taojax.datasets.simulate import make_world, seen_places
 from taojax.datasets.world import NOTE, WorldConfig
 from taojax.errors import InputError
-from taojax.specs import read_npy, read_npz, read_text, write_atomically
+from taojax.specs import read_npy, read_npz, write_atomically
 from taojax.tables import read_table, table_text
 
 __all__ = ["folder_source", "read_poses", "world_source", "write_logs"]
@@ -47,14 +47,6 @@ def read_poses(path: Path, spec: str) -> np.ndarray:
     return np.stack([table[name] for name in _POSE], axis=1)
 
 
-def _notes(path: Path) -> tuple[str, ...]:
-    try:
-        notes = tomllib.loads(read_text(path)).get("notes", []) if path.exists() else []
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not TOML ({error}); expected notes = [...]") from error
-    return tuple(str(note) for note in ([notes] if isinstance(notes, str) else notes))
-
-
 def folder_source(folder: Path) -> Source:
     """Read a data folder with truth to splice from.
 
@@ -80,7 +72,7 @@ def folder_source(folder: Path) -> Source:
             f"{path}: {len(views[0])} rows, but {folder / 'truth/query_poses.csv'} has"
             f" {len(query_poses)}; both must describe the same frames"
         )
-    return Source(map_poses, query_poses, None, map_views, views, _notes(folder / "about.toml"))
+    return Source(map_poses, query_poses, None, map_views, views, read_about(folder).notes)
 
 
 def _said(source: Source, logs: Sequence[Log]) -> list[str]:

@@ -14,7 +14,6 @@ from taojax.errors import InputError
 from taojax.specs import fail
 
 __all__ = [
-    "Listed",
     "Matching",
     "agreed_headings",
     "check_unit",
@@ -59,14 +58,6 @@ class Matching:
                 f"a gate of {self.gate_s:g} s for a share of {self.least:g} of the frames matches"
                 " nothing; the gate is positive, the share from 0 to 1"
             )
-
-
-@dataclass(frozen=True)
-class Listed(Session):
-    """A session whose images do not all have a pose."""
-
-    listed: tuple[str, ...] = ()
-    """Names of all images: descriptors are made of them, before anybody knows the poses."""
 
 
 def present(path: Path) -> Path:
@@ -254,7 +245,7 @@ def matched_session(
         raise fail(source, what, "compare the clocks, widen --gate-s or lower --least-matched")
     kept = tuple(name for name, is_there in zip(names, is_matched, strict=True) if is_there)
     found = Trajectory(t_s[is_matched], poses[is_matched])
-    return Listed(kept, found, True, (*notes, said), listed=names)
+    return Session(kept, found, True, (*notes, said), listed=names)
 
 
 def own_session(names: Sequence[str], drive: Trajectory, notes: Sequence[str]) -> Session:

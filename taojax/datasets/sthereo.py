@@ -6,7 +6,6 @@ import numpy as np
 
 from taojax.datasets.folder import Session
 from taojax.datasets.sessions import (
-    Listed,
     Matching,
     agreed_headings,
     check_unit,
@@ -104,7 +103,7 @@ def read_frame_list(path: Path) -> Session:
     stays = np.concatenate([[True], np.diff(stamps) > 0])
     kept = tuple(name for name, is_first in zip(names, stays, strict=True) if is_first)
     said = "a frame list: every frame has the position of the pose nearest in time, and the"
-    return Listed(
+    return Session(
         kept,
         Trajectory(flat.t_s, np.column_stack([xy, headings(xy)])),
         True,

@@ -1,14 +1,14 @@
 """The way in: sensor files become checked arrays here, and are believed from here on."""
 
 import dataclasses
-import tomllib
 from pathlib import Path
 
 import numpy as np
 
+from taojax.about import read_about
 from taojax.errors import InputError
 from taojax.records import digest_file
-from taojax.specs import read_npy, read_npz, read_text
+from taojax.specs import read_npy, read_npz
 from taojax.tables import read_table
 
 DESCRIPTORS = (
@@ -153,27 +153,6 @@ def _load_retrievals(path: Path, n_map: int, n_query: int, odometry: Path) -> Re
     return Retrievals(index.astype(np.int32), np.minimum(similarity, 1.0))
 
 
-def _load_about(path: Path, n_query: int) -> tuple[tuple[str, ...], int | None]:
-    """Return the notes and the length of a trial."""
-    if not path.exists():
-        return (), None
-    try:
-        about = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not TOML ({error}); expected notes = [...]") from error
-    notes, frames = about.get("notes", []), about.get("trial_frames")
-    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
-        raise InputError(f"{path}: notes is not a list of sentences; expected notes = [...]")
-    if frames is None:
-        return tuple(notes), None
-    if type(frames) is not int or frames < 1 or n_query % frames:
-        raise InputError(
-            f"{path}: trial_frames is {frames!r}; expected a whole number of frames, at least 1,"
-            f" that divides the {n_query} rows of query/odometry.csv"
-        )
-    return tuple(notes), frames
-
-
 def load_observations(folder: Path) -> Observations:
     """Load and check a data folder; the only reader of sensor files. Never looks into truth/.
 
@@ -198,7 +177,7 @@ def load_observations(folder: Path) -> Observations:
         names = descriptor_names(folder)
         descriptors = _load_descriptors(folder, names, n_map, n_query)
         files += names
-    notes, trial_frames = _load_about(folder / "about.toml", n_query)
+    notes, trial_frames = read_about(folder, n_query)
     files += ["about.toml"] if (folder / "about.toml").exists() else []
     motion = np.stack([odometry[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
     return Observations(

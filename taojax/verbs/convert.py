@@ -180,7 +180,7 @@ def _vivid(data: Vivid, matching: "Matching") -> "Sessions":
 
 
 def _folder(data: Folder, matching: "Matching") -> "Sessions":
-    from taojax.datasets.convert import notes_of
+    from taojax.about import read_about
     from taojax.datasets.plain import read_plain, read_traverse
 
     if data.map is None and (data.folder / "poses.csv").is_file():
@@ -189,7 +189,7 @@ def _folder(data: Folder, matching: "Matching") -> "Sessions":
         mapped, query = read_plain(data.folder)
     else:
         mapped, query = read_traverse(data.map)[0], read_traverse(data.folder)[0]
-    said = (*query.notes, *notes_of(data.folder))
+    said = (*query.notes, *read_about(data.folder).notes)
     return mapped, dataclasses.replace(query, notes=said)
 
 

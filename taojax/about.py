@@ -1,0 +1,46 @@
+"""What a data folder says of itself: about.toml."""
+
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+from taojax.specs import fail, read_text
+
+
+class About(NamedTuple):
+    """Facts that the report repeats, and how a log is cut."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences, such as: simulated descriptors."""
+
+    trial_frames: int | None = None
+    """The log is a row of trials of so many frames, each with a fresh start; None = one log."""
+
+
+def read_about(folder: Path, n_query: int | None = None) -> About:
+    """Read about.toml; a folder without one says nothing.
+
+    Args:
+        folder: a data folder.
+        n_query: frames of the log, which trials must divide; None where they do not matter.
+
+    Raises:
+        InputError: the file is not TOML, or an entry is not what it should be.
+    """
+    path = folder / "about.toml"
+    if not path.exists():
+        return About()
+    try:
+        about = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise fail(path, f"is not TOML ({error})", "expected notes = [...]") from error
+    notes, frames = about.get("notes", []), about.get("trial_frames")
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise fail(path, "notes is not a list of sentences", "expected notes = [...]")
+    if frames is None:
+        return About(tuple(notes))
+    if type(frames) is not int or frames < 1 or (n_query or frames) % frames:
+        log = "log" if n_query is None else f"{n_query} rows of query/odometry.csv"
+        what = f"trial_frames is {frames!r}"
+        raise fail(path, what, f"expected a whole number, at least 1, that divides the {log}")
+    return About(tuple(notes), frames)
