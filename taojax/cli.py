@@ -4,6 +4,7 @@ The flags are plain dataclasses: `--help` answers without importing jax.
 """
 
 import os
+import sys
 import traceback
 
 import tyro
@@ -73,6 +74,10 @@ def main(argv: list[str] | None = None) -> int:
     except TaojaxError as error:
         say(f"taojax: {error}")
         return next(code for kind, code in EXIT_CODES.items() if isinstance(error, kind))
+    except BrokenPipeError:
+        # Whoever read the output, such as `head`, has seen enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         say("taojax: interrupted; what is sealed is kept")
         return 130

@@ -205,3 +205,12 @@ def test_simulate_writes_a_folder_that_scores(tmp_path):
     assert main(["score", str(world), "--out", str(tmp_path / "run"), *FLAGS]) == 0
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert any("simulated" in note for note in manifest["notes"])
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(data_folder):
+    words = [sys.executable, "-c", "from taojax.cli import main; raise SystemExit(main())"]
+    words += ["inspect", str(data_folder)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+        child.stdout.close()
+        assert child.stderr.read() == b""
+    assert child.returncode == 0

@@ -66,3 +66,9 @@ def test_an_ablation_is_one_vmap_and_is_judged_on_the_other_half():
     assert names["table"].shape == (4, 4)
     assert names["table"][3, 0] < names["table"][0, 0]
     assert all(np.isfinite(names["slopes"]))
+
+
+def test_a_plain_folder_becomes_a_data_folder_that_passes_inspection():
+    names = run("06_your_own_data.py")
+    assert names["inspected"] == 0
+    assert (names["data"] / "query/odometry.csv").is_file()

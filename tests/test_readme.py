@@ -45,7 +45,7 @@ def test_the_robot_program_runs_as_printed(rng):
 
 def test_every_verb_of_the_readme_exists(capsys):
     verbs = set(re.findall(r"`taojax ([a-z]+)\b", README))
-    assert len(verbs) == 8
+    assert verbs >= {"audit", "score", "evaluate", "kidnap", "sweep", "convert", "inspect"}
     for verb in verbs:
         with pytest.raises(SystemExit) as stop:
             main([verb, "--help"])
