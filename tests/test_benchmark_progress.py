@@ -20,7 +20,7 @@ SMALL = Config(
 
 def views(rng, n_map=140, n_query=140):
     places = rng.normal(size=(n_map + 3, 16))
-    places = sum(places[k : k + n_map] for k in range(4)).astype(np.float32)
+    places = np.sum([places[k : k + n_map] for k in range(4)], axis=0).astype(np.float32)
     at = np.round(np.linspace(0, n_map - 1, n_query)).astype(int)
     return places, (places[at] + rng.normal(size=(n_query, 16))).astype(np.float32)
 

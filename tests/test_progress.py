@@ -31,7 +31,7 @@ def drives(n_map=120, n_query=120, noise=0.5, dim=24):
     """Two drives along one route whose places look a little like their neighbours."""
     rng = np.random.default_rng(5)
     places = rng.normal(size=(n_map + 4, dim))
-    places = sum(places[k : k + n_map] for k in range(5))
+    places = np.sum([places[k : k + n_map] for k in range(5)], axis=0)
     at = np.round(np.linspace(0, n_map - 1, n_query)).astype(int)
     query = places[at] + noise * rng.normal(size=(n_query, dim)) * np.sqrt(5.0)
     return route_of_shares(places.astype(np.float32), query.astype(np.float32))
@@ -64,6 +64,7 @@ def test_the_folder_is_one_that_the_loader_accepts_and_says_what_was_simulated(t
     assert not seen.odometry[:, 1:].any()
     kept = retained(route, ProgressConfig(n_anchors=60))
     np.testing.assert_array_equal(seen.map_xyt[:, 0], kept)
+    assert seen.descriptors is not None
     np.testing.assert_array_equal(seen.descriptors[0], route.map_views[kept])
 
 

@@ -17,6 +17,9 @@ NEIGHBOURS = 12
 REACH_DELTAS = 3.0
 """A grid cell knows an anchor within so many Huber thresholds."""
 
+ON_EDGES = 0.1
+"""Share of anchors that one corner must serve better than the other to be preferred."""
+
 MAX_CELLS = 1500
 """Cells along the longer side at most; a larger map gets coarser cells, not more memory."""
 
@@ -64,6 +67,7 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
     reach = REACH_DELTAS * delta_m
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     cell_m = max(spacing_m, float((high - low).max()) / MAX_CELLS)
+    low = _corner(tree, low, cell_m)
     shape = np.ceil((high - low) / cell_m).astype(int) + 1
     centres = [low[axis] + (np.arange(shape[axis]) + 0.5) * cell_m for axis in (0, 1)]
     points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -84,6 +88,19 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
         neighbour_m2=jnp.asarray(gap**2, jnp.float32),
         neighbour_cost=jnp.asarray(np.where(r <= 1, 0.5 * r**2, r - 0.5), jnp.float32),
     )
+
+
+def _corner(tree: KDTree, low: np.ndarray, cell_m: float) -> np.ndarray:
+    """Place the grid so that anchors find themselves.
+
+    Anchors of an evenly spaced, axis-aligned map may all lie on cell edges, as far from the centre
+    of their cell as their neighbours: half a cell further they are its centre.
+    """
+    xy, corners, found = tree.data, (low, low - 0.5 * cell_m), []
+    for corner in corners:
+        centre = corner + (np.floor((xy - corner) / cell_m) + 0.5) * cell_m
+        found.append(np.mean(tree.query(centre)[1] == np.arange(len(xy))))
+    return corners[int(found[1] > found[0] + ON_EDGES)]
 
 
 def map_tables(

@@ -1,0 +1,25 @@
+"""The map's look-up tables."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from taojax.core.association import look_up
+from taojax.runtime.maps import map_tables
+
+
+@pytest.mark.parametrize("spacing_m", [0.1, 1.0, 5.0])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_every_anchor_of_an_evenly_spaced_line_finds_itself(spacing_m, axis):
+    poses = np.zeros((400, 3))
+    poses[:, axis] = spacing_m * np.arange(400)
+    tables = map_tables(poses)
+    found = look_up(tables.grid, jnp.asarray(poses[:, :2], jnp.float32))
+    np.testing.assert_array_equal(found, np.arange(400))
+
+
+def test_every_anchor_of_a_lattice_finds_itself():
+    x, y = np.meshgrid(np.arange(20.0), np.arange(15.0), indexing="ij")
+    poses = np.c_[x.ravel(), y.ravel(), np.zeros(300)] * 2.0
+    grid = map_tables(poses).grid
+    np.testing.assert_array_equal(look_up(grid, grid.xy), np.arange(300))
