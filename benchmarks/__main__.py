@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from taojax.errors import TaojaxError
+from taojax.errors import GateError, TaojaxError
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where real recordings lie when `--data` does not say: beside the checkout."""
@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
             speed.run(out, quick=args.quick, gate=args.gate, blessed=args.bless)
         except TaojaxError as error:
             print(error, file=sys.stderr)
-            return 5
+            return 5 if isinstance(error, GateError) else 3
     else:
         from benchmarks import quality
 

@@ -2,21 +2,30 @@
 
 What limits the speed on a CPU (2 cores, XLA of jaxlib 0.10, one run; ratios in the README):
 
-* A single call. Of the 1.2 ms of a joint step half is XLA's own dispatch: about 400 kernels of 1 to
-  5 us each, 1 us of bookkeeping for each of them, and memory handed out and taken back. The same
-  frame inside a `lax.scan` takes .52 ms, so replay whatever is recorded.
+* A single call. XLA keeps books on every buffer of a compiled function in every call, also on
+  those inside the little programs of its reductions: a joint step held 631 of them in 180 sums and
+  minima and spent half of its time there. Sums as matrix products, minima without argmin and moved
+  branches left 160: 1,140 -> 830 us. What remains is Python (60 us), handing memory out and back,
+  and threads that wake each other.
+* A frame of the literal cost. With the branches in front (`vmap`), sums run over the innermost axis
+  and XLA emits scalar loops; with the branches innermost, elementwise kernels take .3 to .7 us
+  instead of 2 to 4, and sums by matrix product 1.4: 120 -> 45 us alone, 144 -> 84 us in a replay.
+  Several sums that feed one expression are fused into one scalar loop whatever their layout, and
+  an optimisation barrier between them is removed before fusion. 300 branches cost 184 us, 1,000
+  cost 518; under `vmap` it was 520 for 300.
 * The largest kernels of a joint frame: spreading the recursive belief over 12 neighbours (48,000
-  gathers, .11 ms), pooling a list over the map (24,000 gathers, .07 ms).
+  gathers and 24,000 exponentials, .09 ms), the look-up behind it (24,000 gathers), pooling a list
+  over the map (24,000 gathers, .07 ms).
 
 What did not help: one thread instead of two, no asynchronous dispatch, donated state, state packed
-into one array, the step inside a loop of one turn, tuned malloc thresholds; for the literal cost
-sums over the leading axis and unrolled sums. Moments by matrix products instead of sums took it
-from 100 to 73 us alone; not taken, it is a twentieth of a joint step.
+into one array, the step inside a loop of one turn, tuned malloc thresholds, wider vectors, fast
+mathematics; several frames of a replay under one vmap; a conditional between sums, so that each
+keeps its own kernel (120 -> 57 us, and a stall on a GPU); moments stacked into one product (the
+copies cost what the sums did); in the recursive filter matrix products instead of sums over 4,000
+numbers (50 us slower).
 
 What did: one array for all signals, coordinates gathered one by one, lists and bytes in the rings,
-map and settings closed over instead of handed in, and no more than 2,000 branch-frames of the
-literal cost under one vmap (beyond, XLA's sums get slower by a jump: 300 branches 1,430 -> 520 us,
-a window of 50 frames 1,180 -> 410 us).
+map and settings closed over instead of handed in.
 """
 
 import csv
