@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from taojax.audit.truth import read_truth
@@ -21,7 +20,7 @@ from taojax.datasets.simulate import (
     simulated_odometry,
 )
 from taojax.runtime.observations import load_observations
-from taojax.runtime.retrieval import normalise, retrieve, similarities
+from taojax.runtime.retrieval import dense, retrieve
 from taojax.runtime.rivals import dense_lists
 from taojax.runtime.score import candidates
 from taojax.tables import read_table
@@ -101,19 +100,13 @@ def _described(
 ) -> DataSet:
     """Complete a set whose map and query images have descriptors."""
     index, similarity = retrieve(*descriptors)
-    map_rows = jnp.asarray(normalise(descriptors[0]))
-    queries = normalise(descriptors[1])
-    parts = [
-        np.asarray(similarities(map_rows, jnp.asarray(queries[start : start + 512])))
-        for start in range(0, len(queries), 512)
-    ]
     return DataSet(
         *names,
         map_poses=log.map_poses,
         odometry=log.odometry.astype(np.float32),
         index=index,
         similarity=similarity,
-        rows=np.concatenate(parts),
+        rows=dense(*descriptors),
         map_descriptors=np.asarray(descriptors[0]),
         truth_m=log.truth_m,
         seen_m=log.seen_m,

@@ -25,6 +25,9 @@ MAP_BLOCK = 32_768
 """Map rows per block and device; bounds memory at two blocks of MAP_BLOCK x D on each, and one
 more on the host."""
 
+DENSE_QUERIES = 512
+"""Queries per block where every similarity is kept."""
+
 N_KEPT = 100
 """Candidates kept per frame, the paper's K: recall@100 needs them whatever the branches."""
 
@@ -69,6 +72,21 @@ def similarities(
     """
     product = jnp.matmul(map_rows, query_rows.T, precision=jax.lax.Precision.HIGHEST)
     return jnp.clip(product, -1.0, 1.0).T
+
+
+def dense(map_descriptors: np.ndarray, query_descriptors: np.ndarray) -> np.ndarray:
+    """Return `(T, M)` cosines of every query with every map image, a block of queries at a time.
+
+    Args:
+        map_descriptors: `(M, D)`, any scale.
+        query_descriptors: `(T, D)`.
+    """
+    rows, n = jnp.asarray(normalise(map_descriptors)), DENSE_QUERIES
+    parts = [
+        np.asarray(similarities(rows, jnp.asarray(normalise(query_descriptors[at : at + n]))))
+        for at in range(0, len(query_descriptors), n)
+    ]
+    return np.concatenate(parts)
 
 
 def prepare(map_descriptors: np.ndarray, mesh: Mesh | None = None) -> Places:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -16,7 +15,7 @@ from taojax.baselines.topometric import TopometricParams, topometric
 from taojax.baselines.trajectory_prior import trajectory_prior
 from taojax.records import SealedTrack
 from taojax.runtime.observations import Observations
-from taojax.runtime.retrieval import normalise, similarities
+from taojax.runtime.retrieval import dense
 from taojax.runtime.stream import Frame, StreamRecord
 
 
@@ -63,10 +62,7 @@ def dense_lists(index: np.ndarray, similarity: np.ndarray, n_map: int) -> np.nda
 def _dense(observations: Observations, frames: Frame, chosen: slice) -> np.ndarray:
     """Return the similarity of some frames to every map row."""
     if observations.descriptors is not None:
-        views = (normalise(part) for part in (
-            observations.descriptors[0], observations.descriptors[1][chosen]
-        ))  # fmt: skip
-        return np.asarray(similarities(*(jnp.asarray(view) for view in views)))
+        return dense(observations.descriptors[0], observations.descriptors[1][chosen])
     index, similarity = np.asarray(frames.index)[chosen], np.asarray(frames.similarity)[chosen]
     return dense_lists(index, similarity, len(observations.map_poses["t_s"]))
 

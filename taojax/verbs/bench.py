@@ -35,7 +35,7 @@ def simulated_drive(n_frames: int) -> "Drive":
 
     from taojax.datasets.simulate import WorldConfig, make_world
     from taojax.runtime.bench import Drive
-    from taojax.runtime.retrieval import normalise, retrieve
+    from taojax.runtime.retrieval import dense, retrieve
 
     world = make_world(WorldConfig(), 0)
     queries = world.query_descriptors[:n_frames]
@@ -46,7 +46,7 @@ def simulated_drive(n_frames: int) -> "Drive":
         world.odometry[:n_frames, 1:].astype(np.float32),
         index,
         similarity,
-        normalise(queries) @ normalise(world.map_descriptors).T,
+        dense(world.map_descriptors, queries),
     )
 
 
