@@ -72,3 +72,5 @@ def test_a_plain_folder_becomes_a_data_folder_that_passes_inspection():
     names = run("06_your_own_data.py")
     assert names["inspected"] == 0
     assert (names["data"] / "query/odometry.csv").is_file()
+    assert names["auroc"]["tao"] > names["auroc"]["top1"] + 0.05
+    assert set(names["found"]) <= {"ok", "warming_up", "lost"}
