@@ -28,14 +28,15 @@ from taojax.datasets.simulate import WorldConfig, make_world
 # %% [markdown]
 # ## Descriptors of thermal images (AnyThermal with SALAD)
 #
-# Backbone DINOv2 ViT-B/14, head SALAD: 64 clusters x 128 + token 256 = 8,448 floats. Every step is that of the
-# public code, for both sessions alike:
+# Backbone DINOv2 ViT-B/14, head SALAD: 64 clusters x 128 + token 256 = 8,448 floats. Every step is
+# that of the public code, for both sessions alike:
 #
-# 1. 14-bit image (uint16, 512 x 640) to 8 bit: **each image** from its 1st to its 99th percentile. Counts fill
-#    a small part of the whole range, which would give a nearly black image.
+# 1. 14-bit image (uint16, 512 x 640) to 8 bit: **each image** from its 1st to its 99th percentile.
+#    Counts fill a small part of the whole range, which would give a nearly black image.
 # 2. CLAHE: `cv2.createCLAHE(clipLimit=2.0, tileGridSize=(8, 8)).apply(image)`.
 # 3. Gray to three equal channels, divided by 255.
-# 4. Bilinear to multiples of 14, rounded down (504 x 630); the *published* SALAD weights want 322 x 322.
+# 4. Bilinear to multiples of 14, rounded down (504 x 630); the *published* SALAD weights want
+#    322 x 322.
 # 5. Subtract the mean, divide by the deviation: AnyThermal those below, published SALAD ImageNet's.
 # 6. The network; one row per image, images sorted by name, unit length, float16 or float32.
 
@@ -46,28 +47,33 @@ def eight_bit(image):
     return np.clip((image - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
 
 
+# %%
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
 
+# %%
 def network_input(gray):
     rgb = np.repeat(gray[None].astype(np.float32) / 255, 3, axis=0)
     return (rgb - np.float32(MEAN)[:, None, None]) / np.float32(DEVIATION)[:, None, None]
 
 
+# %%
 def unit(rows):
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
+# %%
 counts = np.random.default_rng(0).normal(3300, 120, (512, 640)).astype(np.uint16)
 gray = eight_bit(counts)
 print(f"counts {counts.min()} to {counts.max()} -> {gray.min()} to {gray.max()}")
-assert network_input(gray).shape == (3, 512, 640)
+print(network_input(gray).shape)
 
 # %% [markdown]
 # ## A plain folder
 #
-# Poses, the two descriptor files that VPR-methods-evaluation saves, and odometry in a format that you already have:
-# here a TUM trajectory as any visual odometry writes it. The frames are a simulated world.
+# Poses, the two descriptor files that VPR-methods-evaluation saves, and odometry in a format that
+# you already have: here a TUM trajectory as any visual odometry writes it. The frames are a
+# simulated world.
 
 # %%
 root = Path(tempfile.mkdtemp())
@@ -87,16 +93,17 @@ def as_tum(poses):
     return np.stack([*poses[:, :3].T, z, z, z, np.sin(half), np.cos(half)], axis=1)
 
 
+# %%
 np.savetxt(root / "odometry.tum", as_tum(world.query_poses), "%.9f")
 
 # %% [markdown]
-# On the command line: `taojax convert folder mine data --odometry odometry.tum --odometry-kind tum`. Public
-# data sets have converters of their own: `taojax convert --help`.
+# On the command line: `taojax convert folder mine data --odometry odometry.tum --odometry-kind
+# tum`. Public data sets have converters of their own: `taojax convert --help`.
 
 # %%
 data = root / "data"
 words = ["convert", "folder", str(mine), str(data)]
-assert main([*words, "--odometry", str(root / "odometry.tum"), "--odometry-kind", "tum"]) == 0
+converted = main([*words, "--odometry", str(root / "odometry.tum"), "--odometry-kind", "tum"])
 print(*sorted(str(path.relative_to(data)) for path in data.rglob("*.*")), sep="\n")
 
 # %% [markdown]
@@ -106,7 +113,7 @@ print(*sorted(str(path.relative_to(data)) for path in data.rglob("*.*")), sep="\
 
 # %%
 inspected = main(["inspect", str(data)])
-assert inspected == 0
+inspected
 
 # %% [markdown]
 # From here on: `taojax audit data --r-in 5 --r-out 10`.
@@ -135,11 +142,11 @@ seen = (places + rng.normal(0, 3.5, places.shape)).astype(np.float32)
 
 # %%
 with tempfile.TemporaryDirectory() as scratch:
-    data, run = Path(scratch) / "data", Path(scratch) / "run"
-    write_progress(data, route_of_shares(places, seen), ProgressConfig(), seed=0)
+    route, run = Path(scratch) / "route", Path(scratch) / "run"
+    write_progress(route, route_of_shares(places, seen), ProgressConfig(), seed=0)
     config = Config(audit=AuditConfig(r_in_m=2.0, r_out_m=10.0, n_bootstrap=50))  # rows
-    score(data, run, config)
-    judged = judge(read_run(run), read_truth(data / "truth", 300), config)
+    score(route, run, config)
+    judged = judge(read_run(run), read_truth(route / "truth", 300), config)
 
 # %% [markdown]
 # The literal cost, the similarity gates and the joint cost, over all labelled frames:
