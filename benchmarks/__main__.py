@@ -39,6 +39,12 @@ def _parser() -> argparse.ArgumentParser:
     speed.add_argument("--out", type=Path, help="folder to make (default runs/speed/TIME)")
     speed.add_argument("--gate", action="store_true", help="fail where a ratio got worse")
     speed.add_argument("--bless", action="store_true", help="make this run the baseline")
+    reliability = verbs.add_parser("reliability", help="bad input, numbers, faults, long streams")
+    reliability.add_argument("--quick", action="store_true", help="hundreds of cases")
+    reliability.add_argument("--only", default="", help="of fuzz,numbers,faults,stream")
+    reliability.add_argument(
+        "--out", type=Path, help="folder to make (default runs/reliability/TIME)"
+    )
     return parser
 
 
@@ -73,6 +79,10 @@ def main(arguments: list[str] | None = None) -> int:
         except TaojaxError as error:
             print(error, file=sys.stderr)
             return 5 if isinstance(error, GateError) else 3
+    elif args.verb == "reliability":
+        from benchmarks import reliability
+
+        return 1 if reliability.run(out, quick=args.quick, only=args.only) else 0
     else:
         from benchmarks import quality
 

@@ -46,10 +46,10 @@ def _nothing_carried(*args: Any) -> jax.Array:
     return seeds.at[-2:].set(seeds[0])
 
 
-_SEEDS = joint._seeds
+_SEEDS = joint.seeds_of
 SWAPS: dict[str, tuple[Any, str, Any]] = {
-    "one travel direction": (joint, "_seeds", _one_direction),
-    "no carried branch": (joint, "_seeds", _nothing_carried),
+    "one travel direction": (joint, "seeds_of", _one_direction),
+    "no carried branch": (joint, "seeds_of", _nothing_carried),
     "two alternations": (association, "ROUNDS", 2),
     "no re-fit": (association, "ROUNDS", 0),
 }

@@ -20,14 +20,20 @@ from taojax.errors import (
 from taojax.verbs import (
     audit,
     bench,
+    closures,
+    compare,
     convert,
+    doctor,
     evaluate,
+    explain,
     export,
     inspect,
     kidnap,
+    rerun,
     score,
     simulate,
     sweep,
+    watch,
 )
 from taojax.verbs.common import say
 
@@ -43,6 +49,12 @@ Verb = (
     | kidnap.Kidnap
     | sweep.Sweep
     | export.Export
+    | closures.Closures
+    | explain.Explain
+    | watch.Watch
+    | compare.Compare
+    | rerun.Rerun
+    | doctor.Doctor
     | bench.Bench
 )
 RUN = {
@@ -55,6 +67,12 @@ RUN = {
     kidnap.Kidnap: kidnap.run,
     sweep.Sweep: sweep.run,
     export.Export: export.run,
+    closures.Closures: closures.run,
+    explain.Explain: explain.run,
+    watch.Watch: watch.run,
+    compare.Compare: compare.run,
+    rerun.Rerun: rerun.run,
+    doctor.Doctor: doctor.run,
     bench.Bench: bench.run,
 }
 
@@ -64,12 +82,12 @@ def main(argv: list[str] | None = None) -> int:
 
     Returns:
         0 ok, 1 internal error, 2 usage, 3 bad input, 4 missing extra, 5 slower
-        than the baseline, 130 interrupted.
+        than the baseline or not reproduced, 130 interrupted.
     """
-    args = tyro.cli(Verb, prog="taojax", args=argv, description=ABOUT)
     # Matplotlib's cache and XLA's notices are not the user's business.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     try:
+        args = tyro.cli(Verb, prog="taojax", args=argv, description=ABOUT)
         RUN[type(args)](args)
     except TaojaxError as error:
         say(f"taojax: {error}")

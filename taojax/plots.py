@@ -36,6 +36,14 @@ OUTCOMES = {
 """Outcome of a frame -> how it is drawn; the dangerous one last, on top."""
 
 
+def _legend_above(ax: Axes, *, columns: int) -> None:
+    # Inside, some corner always holds a point of some run.
+    ax.legend(
+        frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=columns,
+        columnspacing=1.2, handlelength=2.4,
+    )  # fmt: skip
+
+
 def retrieval_curve(recall: Mapping[float, np.ndarray], *, ax: Axes) -> Axes:
     """Draw recall@K over all queries.
 
@@ -45,12 +53,14 @@ def retrieval_curve(recall: Mapping[float, np.ndarray], *, ax: Axes) -> Axes:
     """
     for number, (radius, curve) in enumerate(recall.items()):
         k = np.arange(1, len(curve) + 1)
-        ax.plot(k, curve, color=CYCLE[number], linestyle=STYLES[number], label=f"{radius:g} m")
+        ax.plot(
+            k, curve, color=CYCLE[number], linestyle=STYLES[number], label=f"within {radius:g} m"
+        )
     ax.set(xscale="log", xlabel="candidates K", ylabel="recall@K over all queries", ylim=(0, 1.02))
     ax.set_xticks([1, 5, 10, 100], ["1", "5", "10", "100"])
     ax.minorticks_off()
     ax.grid(alpha=0.25)
-    ax.legend(title="right within", frameon=False, loc="lower right")
+    _legend_above(ax, columns=len(recall))
     return ax
 
 
@@ -76,11 +86,14 @@ def signal_trace(
     frame = np.arange(len(signal))
     edges = np.flatnonzero(np.diff(np.r_[0, is_out.astype(int), 0]))
     for start, end in zip(edges[::2], edges[1::2], strict=True):
-        ax.axvspan(start - 0.5, end - 0.5, color=MAP_OUT, alpha=0.15, linewidth=0)
-    ax.plot(frame, signal, color=IN_MAP, linewidth=0.8)
+        ax.axvspan(
+            start - 0.5, end - 0.5, color=MAP_OUT, alpha=0.15, linewidth=0,
+            label="truly off the map" if start == edges[0] else None,
+        )  # fmt: skip
+    ax.plot(frame, signal, color=IN_MAP, linewidth=0.8, label="signal")
     if np.isfinite(threshold):
-        ax.axhline(threshold, color=INK, linestyle="--", linewidth=0.9)
-    ax.axvline(test_start, color=INK, linestyle=":", linewidth=0.9)
+        ax.axhline(threshold, color=INK, linestyle="--", linewidth=0.9, label="frozen threshold")
+    ax.axvline(test_start, color=INK, linestyle=":", linewidth=0.9, label="start of the test split")
     finite = signal[np.isfinite(signal)]
     if finite.size:
         # One wild frame must not flatten the rest; what is cut off still leaves at the top edge.
@@ -130,7 +143,14 @@ def verdict_map(
     return ax
 
 
-def curves(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], *, x: str, y: str, ax: Axes) -> Axes:
+def curves(
+    lines: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    *,
+    x: str,
+    y: str,
+    ax: Axes,
+    strong: tuple[str, ...] = (),
+) -> Axes:
     """Draw ROC or precision-recall curves on the unit square.
 
     Args:
@@ -138,12 +158,16 @@ def curves(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], *, x: str, y: str
         x: label of the x axis.
         y: label of the y axis.
         ax: where to draw.
+        strong: names whose lines are thicker.
     """
     for number, (name, (right, up)) in enumerate(lines.items()):
-        ax.plot(right, up, color=CYCLE[number], linestyle=STYLES[number], linewidth=1.3, label=name)
+        ax.plot(
+            right, up, color=CYCLE[number], linestyle=STYLES[number], label=name,
+            linewidth=2.4 if name in strong else 1.3,
+        )  # fmt: skip
     ax.set(xlabel=x, ylabel=y, xlim=(-0.01, 1.01), ylim=(-0.01, 1.01))
     ax.grid(alpha=0.25)
-    ax.legend(frameon=False, fontsize=8, loc="lower right")
+    _legend_above(ax, columns=min(3, len(lines)))
     return ax
 
 
@@ -171,7 +195,7 @@ def reliability_diagram(
         xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal",
     )  # fmt: skip
     ax.grid(alpha=0.25)
-    ax.legend(frameon=False, fontsize=8, loc="upper left")
+    _legend_above(ax, columns=2)
     return ax
 
 
@@ -206,6 +230,5 @@ def scenario_dots(
     ax.set_xticks(at, list(scenarios))
     ax.set(ylabel=label, xlabel="scenario", xlim=(-0.6, len(scenarios) - 0.4), ylim=(-0.02, 1.02))
     ax.grid(alpha=0.25, axis="y")
-    # Above the panel: inside, some corner always holds a point.
-    ax.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=4)
+    _legend_above(ax, columns=5)
     return ax

@@ -22,8 +22,9 @@ SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
 """Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
 
 
-CARRIED = ("decisions.csv", "tracks.npz")
-"""Sealed like the others where they were asked for."""
+CARRIED = ("odometry.csv", "decisions.csv", "detector.toml", "tracks.npz")
+"""Sealed like the others where they are there: odometry since runs can be explained, the rest where
+it was asked for."""
 
 
 class SealedTrack(NamedTuple):
@@ -147,7 +148,9 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     similarity: np.ndarray,
     config_toml: str,
     manifest: Mapping[str, Any],
+    odometry: bytes | None = None,
     decisions: Mapping[str, np.ndarray] | None = None,
+    detector_toml: str | None = None,
     tracks: Mapping[str, SealedTrack] | None = None,
 ) -> dict[str, Any]:
     """Seal one run.
@@ -160,7 +163,9 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
         similarity: (T, 100).
         config_toml: resolved settings.
         manifest: facts about the run; `sha256` may already hold hashes of the inputs.
+        odometry: bytes of query/odometry.csv, unchanged: a copy that rounds is another input.
         decisions: columns of data_specs/decisions.toml where a calibration was carried along.
+        detector_toml: the calibration that decided.
         tracks: rivals by name, where they were asked for.
 
     Returns:
@@ -177,6 +182,10 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
         ),
         "signals.csv": table_text("signals", signals).encode(),
     }
+    if odometry is not None:
+        files["odometry.csv"] = odometry
+    if detector_toml is not None:
+        files["detector.toml"] = detector_toml.encode()
     if decisions is not None:
         files["decisions.csv"] = table_text("decisions", decisions).encode()
     if tracks is not None:

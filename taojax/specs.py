@@ -6,8 +6,10 @@ and writers take the column order from it, so a file and its documentation canno
 
 import functools
 import io
+import lzma
 import os
 import secrets
+import tokenize
 import tomllib
 import zipfile
 import zlib
@@ -21,6 +23,12 @@ from taojax.errors import InputError
 
 MAX_BYTES = 8 << 30
 """Largest array file that is opened, bytes; guards against bombs inside npz archives."""
+
+ARRAY_FAULTS = (
+    ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, MemoryError,
+    OverflowError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
+"""What numpy and zipfile raise for damaged or hostile bytes."""
 
 GZIP = b"\x1f\x8b"
 """How a compressed file begins."""
@@ -47,12 +55,21 @@ def fail(path: Path, what: str, fix: str) -> InputError:
     return InputError(f"{path}: {what}; {fix}")
 
 
+def first_line(error: Exception) -> str:
+    """Return what an exception says, short enough for one line."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:80]
+
+
 def read_bytes(path: Path) -> bytes:
     """Return a file's bytes.
 
     Raises:
-        InputError: missing, a directory, or unreadable.
+        InputError: missing, no regular file, or unreadable.
     """
+    if path.exists() and not path.is_file():
+        # A pipe or a device may never end.
+        kind = "a folder" if path.is_dir() else "a pipe or device"
+        raise fail(path, f"cannot be read (is {kind})", "point at a file")
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
@@ -77,7 +94,9 @@ def read_text(path: Path) -> str:
         raise fail(path, f"line {line} is not UTF-8 text", "save it as plain CSV") from error
 
 
-def _checked_array(path: Path, label: str, array: np.ndarray, spec: Mapping[str, Any]) -> None:
+def _checked_array(path: Path, label: str, array: Any, spec: Mapping[str, Any]) -> None:
+    if not isinstance(array, np.ndarray):
+        raise fail(path, f"{label}is not an array", "save it with np.savez")
     if array.ndim != spec["ndim"]:
         what = f"{label}has shape {array.shape}"
         raise fail(path, what, f"expected {spec['shape']}")
@@ -98,8 +117,8 @@ def read_npy(path: Path, name: str) -> np.ndarray:
         raise fail(path, "no such file", "add it or point at another folder")
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        what = f"is not a plain numpy array ({str(error).splitlines()[0][:80]})"
+    except ARRAY_FAULTS as error:
+        what = f"is not a plain numpy array ({first_line(error)})"
         raise fail(path, what, "save it with np.save as float32") from error
     if not isinstance(array, np.ndarray):
         raise fail(path, "is an archive, not one array", "save it with np.save")
@@ -124,10 +143,8 @@ def read_npz(path: Path, name: str) -> dict[str, np.ndarray]:
             if missing:
                 raise fail(path, f"lacks the array {missing[0]}", "see data_specs/README.md")
             arrays = {spec["name"]: archive[spec["name"]] for spec in specs}
-    except (ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError,
-            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
-        lines = str(error).splitlines() or [type(error).__name__]
-        what = f"is not a plain npz archive ({lines[0][:80]})"
+    except ARRAY_FAULTS as error:
+        what = f"is not a plain npz archive ({first_line(error)})"
         raise fail(path, what, "save it with np.savez") from error
     for spec in specs:
         _checked_array(path, f"{spec['name']} ", arrays[spec["name"]], spec)

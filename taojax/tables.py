@@ -30,24 +30,70 @@ def _cell(path: Path, row: int, column: Mapping[str, Any], text: str) -> float |
         raise fail(path, f"{where}: {text[:40]!r} is not {kind}", "fix the cell") from error
     if not math.isfinite(value):
         raise fail(path, f"{where}: {text} is not finite", "remove the row or repair it")
-    low, high = column.get("min", -math.inf), column.get("max", math.inf)
+    low, high = _limits(column)
     if not low <= value <= high:
-        what = f"{where}: {text} is outside [{low:g}, {high:g}] {column.get('unit', '')}".rstrip()
+        what = (
+            f"{where}: {text[:40]} is outside [{low:g}, {high:g}] {column.get('unit', '')}".rstrip()
+        )
         raise fail(path, what, column.get("fix", "check the unit"))
     return value
 
 
-def _rows(path: Path, spec: Mapping[str, Any]) -> list[tuple[int, list[str]]]:
-    """Return line number and cells of every line that is neither blank at the end nor a comment."""
-    separator, comment = spec.get("separator", ","), spec.get("comment")
-    lines = read_text(path).splitlines()
+def _limits(column: Mapping[str, Any]) -> tuple[float | int, float | int]:
+    """Return the least and the largest value of a column; stamps must fit their 64 bits."""
+    widest = (-(2**63), 2**63 - 1) if column.get("type") == "stamp" else (-math.inf, math.inf)
+    return column.get("min", widest[0]), column.get("max", widest[1])
+
+
+def _column(
+    path: Path, rows: Sequence[int], column: Mapping[str, Any], cells: Sequence[str]
+) -> np.ndarray:
+    """Return one checked column: at once, and cell by cell only to say which one is wrong."""
+    kind = {"text": object, "stamp": np.int64}.get(column.get("type", ""), float)
+    values = None if kind is object else _numbers(column, cells)
+    if values is None:
+        checked = [_cell(path, row, column, cell) for row, cell in zip(rows, cells, strict=True)]
+        values = np.array(checked, dtype=kind)
+    return values
+
+
+def _numbers(column: Mapping[str, Any], cells: Sequence[str]) -> np.ndarray | None:
+    """Return a column of numbers, None where a cell is wrong."""
+    is_stamp, n = column.get("type") == "stamp", len(cells)
+    is_blank = np.zeros(n, bool)
+    if column.get("blank") and "" in cells:
+        is_blank = np.array([cell == "" for cell in cells])
+        cells = [cell or "nan" for cell in cells]
+    try:
+        values = (
+            np.fromiter(map(int, cells), np.int64, n)
+            if is_stamp
+            else np.fromiter(map(float, cells), np.float64, n)
+        )
+    except (ValueError, OverflowError):
+        return None
+    low, high = _limits(column)
+    is_good = is_blank | (np.isfinite(values) & (values >= low) & (values <= high))
+    return values if is_good.all() else None
+
+
+def _lines(path: Path, spec: Mapping[str, Any]) -> tuple[list[int], list[str]]:
+    """Return number and text of every line that is neither blank at the end nor a comment."""
+    comment, lines = spec.get("comment"), read_text(path).splitlines()
     while lines and not lines[-1].strip():
         lines.pop()
-    return [
-        (row, [c.strip() for c in (line.split() if separator == " " else line.split(separator))])
-        for row, line in enumerate(lines, start=1)
-        if not (comment and line.lstrip().startswith(comment))
-    ]
+    if comment is None:
+        return list(range(1, len(lines) + 1)), lines
+    rows = [at for at, line in enumerate(lines) if not line.lstrip().startswith(comment)]
+    return [at + 1 for at in rows], [lines[at] for at in rows]
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    cells = line.split(separator)
+    # A blank is the only printable white space: most lines of a long file need no stripping.
+    return cells if " " not in line and line.isprintable() else [cell.strip() for cell in cells]
 
 
 def _is_header(cells: list[str], layouts: Sequence[Sequence[Mapping[str, Any]]]) -> bool:
@@ -87,33 +133,35 @@ def read_table(path: Path, name: str) -> dict[str, np.ndarray]:
     spec = load_spec(name)
     layouts = _layouts(spec)
     wanted = " or ".join(",".join(column["name"] for column in layout) for layout in layouts)
-    rows = _rows(path, spec)
-    if not rows:
+    rows, lines = _lines(path, spec)
+    separator = spec.get("separator", ",")
+    if not lines:
         raise fail(path, "the file is empty", f"expected the columns {wanted}")
-    header = spec.get("header", "required")
+    header, first = spec.get("header", "required"), _cells(lines[0], separator)
     names = [[column["name"] for column in layout] for layout in layouts]
-    if header == "required" and rows[0][1] not in names:
-        what = f"row 1: header is {','.join(rows[0][1])[:80]!r}"
+    if header == "required" and first not in names:
+        what = f"row 1: header is {','.join(first)[:80]!r}"
         raise fail(path, what, f"expected {wanted}")
-    has_header = header == "required" or (header == "optional" and _is_header(rows[0][1], layouts))
-    rows = rows[has_header:]
-    width = len(rows[0][1]) if rows else len(layouts[0])
+    if header == "required" or (header == "optional" and _is_header(first, layouts)):
+        rows, lines = rows[1:], lines[1:]
+    width = len(_cells(lines[0], separator)) if lines else len(layouts[0])
     columns = next((layout for layout in layouts if len(layout) == width), layouts[0])
-    for row, parts in rows:
+    # One flat list: a list for every row costs the collector more than the parsing.
+    cells: list[str] = []
+    for row, line in zip(rows, lines, strict=True):
+        parts = _cells(line, separator)
         if len(parts) != len(columns):
             what = f"row {row}: {len(parts)} cells where {len(columns)} are expected"
             raise fail(path, what, f"columns are {wanted}")
+        cells += parts
     least = spec.get("min_rows", 0)
     if len(rows) < least:
         raise fail(path, f"{len(rows)} data row(s)", f"at least {least} are needed")
     table = {
-        column["name"]: np.array(
-            [_cell(path, row, column, parts[at]) for row, parts in rows],
-            dtype={"text": object, "stamp": np.int64}.get(column.get("type", ""), float),
-        )
+        column["name"]: _column(path, rows, column, cells[at :: len(columns)])
         for at, column in enumerate(columns)
     }
-    _check_order(path, columns, table, [row for row, _ in rows])
+    _check_order(path, columns, table, rows)
     return table
 
 
@@ -135,11 +183,12 @@ def _check_order(
     for column in columns:
         if not column.get("monotonic") and not column.get("increasing"):
             continue
-        steps = np.diff(table[column["name"]])
-        if (back := np.flatnonzero(steps < 0)).size:
+        # Compared, not subtracted: stamps at both ends of 64 bits have no difference.
+        before, behind = table[column["name"]][:-1], table[column["name"]][1:]
+        if (back := np.flatnonzero(behind < before)).size:
             what = f"row {rows[int(back[0]) + 1]}: {column['name']} runs backwards"
             raise fail(path, what, "sort the rows by time")
-        if column.get("increasing") and (twice := np.flatnonzero(steps == 0)).size:
+        if column.get("increasing") and (twice := np.flatnonzero(behind == before)).size:
             what = f"row {rows[int(twice[0]) + 1]}: {column['name']} is that of the row before"
             raise fail(path, what, "keep one row per stamp")
 

@@ -14,6 +14,8 @@ FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
 VERBS = (
     "audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export", "convert",
     "inspect",
+    "compare", "doctor", "rerun",
+    "closures", "explain", "watch",
 )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from taojax.audit import figures, report, tables
 from taojax.audit.judgement import Evaluation, Judgement, judge
+from taojax.audit.paste import paste_files
 from taojax.audit.truth import Truth, read_truth
 from taojax.audit.words import find_words, terminal_table
 from taojax.config import Config
@@ -90,6 +91,7 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
         table=terminal_table(judgement),
         command=_command(run, truth, config),
     )
+    files |= paste_files(judgement, done.command)
     files["report.html"] = report.run_page(done, pictures)
     folder = out or run
     for name, content in files.items():

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -15,6 +15,13 @@ from taojax.specs import load_spec
 
 TRACED = ("top1", "top1_w10", "velocity", "tao", "fused")
 """Signals that are drawn."""
+
+
+OURS = ("tao", "fused")
+"""Those drawn with thicker lines."""
+
+STRICT = ("top1", "velocity", "c_geom", "tao", "a_aniso")
+"""Signals drawn under strict labels; h_proxy would lie on c_geom, of which it is a logarithm."""
 
 
 class Picture(NamedTuple):
@@ -89,6 +96,14 @@ def diagnostics(judgement: Judgement) -> Picture:
             threshold=float(threshold[name]), test_start=start, ax=ax,
         )  # fmt: skip
     axes[-1].set_xlabel("query frame")
+    figure.align_ylabels()
+    lines: dict[str, Any] = {}
+    for ax in axes:  # The first may lack a line, such as a threshold.
+        handles, labels = ax.get_legend_handles_labels()
+        lines = dict(zip(labels, handles, strict=True)) | lines
+    figure.legend(
+        lines.values(), lines.keys(), loc="outside upper center", ncol=4, frameon=False, fontsize=8
+    )
     columns = {
         "frame": judgement.signals["frame"].astype(int),
         "t_s": judgement.signals["t_s"],
@@ -98,7 +113,7 @@ def diagnostics(judgement: Judgement) -> Picture:
     caption = (
         "Shaded: truly off the map. Dashed: threshold, frozen on the calibration split. Dotted: "
         "start of the test split. Larger means more likely off the map; the highest half per "
-        "cent of values may leave the panel."
+        "cent of values may leave the panel. A signal without a unit is dimensionless."
     )
     return picture(figure, "diagnostics", "Signals over time", caption, csv_text(columns | traces))
 
@@ -169,12 +184,48 @@ def roc_and_pr(judgement: Judgement) -> tuple[Picture, ...]:
         ("pr", "Precision and recall", pr, "map-out frames rejected (recall)",
          "rejected frames truly map-out (precision)"),
     ):  # fmt: skip
-        figure = Figure(figsize=(4.8, 4.4), layout="constrained")
-        plots.curves(lines, x=x, y=y, ax=figure.subplots())
+        figure = Figure(figsize=(4.8, 4.7), layout="constrained")
+        plots.curves(lines, x=x, y=y, ax=figure.subplots(), strong=OURS)
         share = f"prevalence of map-out {is_out.mean():.2f}"
         csv = _stacked(lines, *(("frr", "detected") if name == "roc" else ("recall", "precision")))
         pictures.append(picture(figure, name, title, f"{basis}; {share}.", csv))
     return tuple(pictures)
+
+
+def strict(judgement: Judgement) -> tuple[Picture, ...]:
+    """Draw ROC curves under the strict labels of the micro-scale audit; none with one class."""
+    from sklearn.metrics import roc_curve
+
+    table = judgement.micro
+    radii = [r for r in np.unique(table["radius_m"])
+             if (judgement.nearest_m <= r).any() and (judgement.nearest_m > r).any()]  # fmt: skip
+    if not radii:
+        return ()
+    figure = Figure(figsize=(4.6 * len(radii), 4.9), layout="constrained")
+    parts = []
+    for ax, radius in zip(figure.subplots(1, len(radii), squeeze=False)[0], radii, strict=True):
+        is_out, lines = judgement.nearest_m > radius, {}
+        for name in STRICT:
+            false_alarm, detected, _ = roc_curve(is_out, judgement.signals[name].astype(float))
+            at = (table["radius_m"] == radius) & (table["signal"] == name)
+            lines[f"{name} ({float(table['auroc'][at][0]):.3f})"] = (false_alarm, detected)
+            parts.append((radius, name, false_alarm, detected))
+        ours = tuple(label for label in lines if label.startswith("tao "))
+        x, y = f"frames within {radius:g} m rejected", f"frames beyond {radius:g} m rejected"
+        plots.curves(lines, x=x, y=y, ax=ax, strong=ours)
+        ax.plot([0, 1], [0, 1], color=plots.PALE, linestyle="--", linewidth=0.8, zorder=1)
+    columns = {
+        "radius_m": np.concatenate([np.full(len(a), radius) for radius, _, a, _ in parts]),
+        "signal": np.concatenate([[name] * len(a) for _, name, a, _ in parts]),
+        "rejected_within": np.concatenate([a for *_, a, _ in parts]),
+        "rejected_beyond": np.concatenate([b for *_, b in parts]),
+    }
+    caption = (
+        f"All {len(judgement.label)} frames, without a grey zone: a frame is in the map only "
+        "strictly within the radius. In brackets the AUROC; dashed: a coin."
+    )
+    title = "Micro-scale audit: strict labels"
+    return (picture(figure, "micro", title, caption, csv_text(columns)),)
 
 
 def reliability(judgement: Judgement) -> tuple[Picture, ...]:
@@ -185,7 +236,7 @@ def reliability(judgement: Judgement) -> tuple[Picture, ...]:
     if not known.any() or np.isnan(probability).any():
         return ()
     bins = calibration.reliability(probability, test.is_out[known])
-    figure = Figure(figsize=(4.8, 4.6), layout="constrained")
+    figure = Figure(figsize=(4.8, 4.8), layout="constrained")
     plots.reliability_diagram(
         bins.promised, bins.realised, bins.n_frames, ax=figure.subplots()
     )  # fmt: skip
@@ -202,6 +253,7 @@ def draw(judgement: Judgement) -> tuple[Picture, ...]:
         *roc_and_pr(judgement),
         *reliability(judgement),
         retrieval(judgement),
+        *strict(judgement),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taojax.audit.figures import Picture
+from taojax.audit.glossary import marked
 from taojax.audit.verdicts import plain
 from taojax.specs import load_spec
 
@@ -36,6 +37,9 @@ class Grid(NamedTuple):
     is_half: bool = False
     """Whether two fit side by side."""
 
+    main: tuple[str, ...] = ()
+    """First cells of the rows that are shown until the reader asks for all; empty = all."""
+
 
 class Page(NamedTuple):
     """Everything on one page."""
@@ -50,6 +54,14 @@ class Page(NamedTuple):
     facts: Mapping[str, str]
     command: str
     links: Mapping[str, str] = {}
+    lead: Sequence[str] = ()
+    """Sentences of the first screen, above the numbers; `headline` follows below them."""
+
+    words: Mapping[str, str] = {}
+    """Word -> definition; what hovering over it in a sentence tells."""
+
+    route: str = ""
+    """JSON from `route.route_json`; empty = no section along the route."""
 
 
 def number(value: float, column: Mapping[str, Any]) -> str:
@@ -116,13 +128,27 @@ def _data_uri(svg: bytes) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
 
 
+def _beside(name: str) -> str:
+    return resources.files("taojax.audit").joinpath(name).read_text(encoding="utf-8")
+
+
 def render(page: Page) -> str:
     """Return the page as HTML that needs no network and no other file."""
-    from jinja2 import Environment, StrictUndefined
+    from jinja2 import DictLoader, Environment, StrictUndefined
 
-    source = resources.files("taojax.audit").joinpath("report.html.j2").read_text(encoding="utf-8")
+    names = ("report.html.j2", "route.html.j2")
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+        loader=DictLoader({name: _beside(name) for name in names}),
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
     uris: dict[str, Any] = {drawn.name: _data_uri(drawn.svg) for drawn in page.pictures}
-    return environment.from_string(source).render(page=page, uris=uris)
+    return environment.get_template("report.html.j2").render(
+        page=page,
+        uris=uris,
+        mark=lambda sentence: marked(sentence, page.words),
+        style=_beside("report.css"),
+        scripts={
+            "route": "".join(_beside(f"route_{part}.js") for part in ("data", "map", "panel")),
+            "hover": _beside("hover.js"),
+        },
+    )

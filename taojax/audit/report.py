@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from taojax.audit import figures, summary, tables
+from taojax.audit import figures, scenario_figures, summary, tables
 from taojax.audit.figures import Picture
+from taojax.audit.glossary import about, glossary
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.page import Cell, Grid, Page, grid, render
-from taojax.audit.words import metric_row, rate, span
-from taojax.specs import load_spec, write_atomically
+from taojax.audit.route import route_json
+from taojax.audit.words import MAIN, lead_words, metric_row, rate, span
+from taojax.specs import read_npz, write_atomically
 
 _ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")
 _TEST = (
@@ -26,10 +28,6 @@ _NOT_OURS = "Columns paper_* are the paper's figures on its own recording, not o
 _FROZEN = ("signal", "threshold", "far", "frr", "delay_frames", "n_exits", "n_censored")
 
 
-def _about(name: str) -> str:
-    return next(c["about"] for c in load_spec("metrics")["columns"] if c["name"] == name)
-
-
 def _big(value: float) -> str:
     return "—" if np.isnan(value) else f"{value:.3f}"
 
@@ -40,7 +38,7 @@ def _cards(judgement: Judgement) -> list[Cell]:
     tao = metric_row(judgement, "tao")
     verdict = judgement.verdicts["verdict"][test]
     cards = [
-        Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", "verdicts.csv")
+        Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", glossary()[said])
         for word, said in (("accept", "accepted"), ("reject", "rejected"), ("abstain", "abstained"))
     ]
     far = (
@@ -50,9 +48,9 @@ def _cards(judgement: Judgement) -> list[Cell]:
     auroc = f"AUROC of tao, {span(tao, 'auroc')}, prevalence {tao['prevalence']:.2f}"
     return [
         *cards,
-        Cell(_big(row["far"]), far, _about("far")),
-        Cell(_big(row["frr"]), frr, _about("frr")),
-        Cell(_big(tao["auroc"]), auroc, _about("auroc")),
+        Cell(_big(row["far"]), far, glossary()["FAR"]),
+        Cell(_big(row["frr"]), frr, glossary()["FRR"]),
+        Cell(_big(tao["auroc"]), auroc, about("auroc")),
     ]
 
 
@@ -87,8 +85,13 @@ def _micro_grids(micro: tables.Table) -> list[Grid]:
         part = {name: values[micro["radius_m"] == radius] for name, values in micro.items()}
         title = f"Micro-scale audit: strictly within {radius:g} m"
         columns = ("signal", "n_in", "n_out", "auroc")
-        grids.append(grid("micro", part, title=title, columns=columns))
+        found = grid("micro", part, title=title, columns=columns)
+        grids.append(found._replace(main=figures.STRICT))
     return grids
+
+
+def _main(title: str, table: tables.Table, columns: Sequence[str]) -> Grid:
+    return grid("metrics", table, title=title, columns=columns)._replace(main=MAIN)
 
 
 def _run_grids(judgement: Judgement) -> list[Grid]:
@@ -96,13 +99,14 @@ def _run_grids(judgement: Judgement) -> list[Grid]:
     runtime = {name: values[:-1] for name, values in table.items()}
     probability = {name: values[-1:] for name, values in table.items()}
     scores = ("signal", "n_in_test", "n_out_test", "ece", "brier")
+    conformal = grid("conformal", judgement.conformal, title="Promised false acceptance rate")
     return [
         grid("errors", judgement.errors, title="Localisation error of in-map frames"),
         grid("recall", judgement.recall, title="Answerability and recall over all queries"),
-        grid("metrics", table, title="At the frozen threshold, on the test split", columns=_FROZEN),
-        grid("metrics", runtime, title="Separation over all labelled frames", columns=_ALL_FRAMES),
-        grid("metrics", table, title="Separation on the test split", columns=_TEST),
-        grid("conformal", judgement.conformal, title="Promised false acceptance rate"),
+        _main("At the frozen threshold, on the test split", table, _FROZEN),
+        _main("Separation over all labelled frames", runtime, _ALL_FRAMES),
+        _main("Separation on the test split", table, _TEST),
+        conformal._replace(main=MAIN),
         *_micro_grids(judgement.micro),
         grid("metrics", probability, title="Calibrated probability", columns=scores),
     ]
@@ -113,6 +117,9 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
     judgement = done.judgement
     audit = judgement.config.audit
     dataset = judgement.manifest.get("dataset", done.run)
+    lead = lead_words(judgement)
+    # Its hash was checked before the judge began.
+    found = read_npz(done.run / "retrievals.npz", "retrievals")
     return render(
         Page(
             title=f"May these answers enter the graph? {Path(str(dataset)).name}",
@@ -122,12 +129,15 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
                 f"Seal {str(judgement.manifest['seal'])[:16]}…"
             ),
             notes=_notes(judgement),
-            headline=done.sentences,
+            lead=lead,
+            headline=[sentence for sentence in done.sentences if sentence not in lead],
             cards=_cards(judgement),
             grids=_run_grids(judgement),
             pictures=pictures,
             facts=_facts(done),
             command=done.command,
+            words=glossary(),
+            route=route_json(judgement, found["index"], found["similarity"]),
         )
     )
 
@@ -173,9 +183,7 @@ def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
     for name, done in summary.cut_maps(scenarios).items():
         row = metric_row(done.judgement, "fused")
         cards.append(
-            Cell(
-                _big(row["far"]), f"{name}: FAR of the verdicts, {span(row, 'far')}", _about("far")
-            )
+            Cell(_big(row["far"]), f"{name}: FAR of the verdicts, {span(row, 'far')}", about("far"))
         )
     return cards
 
@@ -206,9 +214,11 @@ def write_summary(
     mapout, recall, micro = (
         summary.mapout_table(scenarios), base.judgement.recall, base.judgement.micro,
     )  # fmt: skip
-    pictures = (summary.maps(scenarios), figures.retrieval(base.judgement))
-    if summary.cut_maps(scenarios):
-        pictures = (summary.compare(scenarios), *pictures)
+    pictures = (
+        summary.maps(scenarios), figures.retrieval(base.judgement), *figures.strict(base.judgement),
+    )  # fmt: skip
+    if cut := summary.cut_maps(scenarios):
+        pictures = (summary.compare(scenarios), scenario_figures.traces(cut), *pictures)
     said = {note for done in scenarios.values() for note in _notes(done.judgement)}
     notes = [*notes, *sorted(said - set(notes))]
     seals = {name: str(done.judgement.manifest["seal"]) for name, done in scenarios.items()}
@@ -218,6 +228,7 @@ def write_summary(
         subtitle=f"{len(scenarios)} scenarios; each was scored, sealed and then judged.",
         notes=notes,
         headline=words,
+        words=glossary(),
         cards=_summary_cards(scenarios),
         grids=[
             grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: AUROC",

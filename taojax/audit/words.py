@@ -10,6 +10,9 @@ from taojax.audit.verdicts import plain
 
 _JOIN_FRAMES = 5  # wrong acceptances this close together are told as one stretch
 _MOST_STRETCHES = 3
+MAIN = ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused")
+"""Signals that are told first; the others stand in the files."""
+
 _MOST = 0.5  # beyond this share a rate is called "most"
 
 
@@ -53,35 +56,43 @@ def _counts(judgement: Judgement) -> list[str]:
     ]
 
 
-def _operating(judgement: Judgement) -> list[str]:
-    row, said = metric_row(judgement, "fused"), []
+def _false_acceptance(judgement: Judgement) -> list[str]:
+    row = metric_row(judgement, "fused")
     if np.isnan(row["threshold"]):
         return ["The calibration split holds no in-map frame, so there is no threshold."]
-    n_in, n_out = int(row["n_in_test"]), int(row["n_out_test"])
-    rule = f"probability <= {plain(row['threshold'])}, frozen on the calibration split"
-    if n_out:
-        passed = round(row["far"] * n_out)
-        if row["far"] > _MOST:
-            said.append(
-                "At this threshold taojax does not protect the map: it accepts most answers "
-                "given off the map."
-            )
+    n_out = int(row["n_out_test"])
+    rule = f"probability {plain(row['threshold'])}, frozen on the calibration split"
+    if not n_out:
+        return [
+            "The test split holds no map-out frame, so there is no false acceptance rate (at or "
+            f"below {rule})."
+        ]
+    said = []
+    if row["far"] > _MOST:
         said.append(
-            f"False acceptance rate {rate(row, 'far')}: {passed} of {n_out} map-out test frames "
-            f"(prevalence {row['prevalence_test']:.2f}) lie at {rule}."
+            "At this threshold taojax does not protect the map: it accepts most answers "
+            "given off the map."
         )
-    else:
-        said.append(
-            f"The test split holds no map-out frame, so there is no false acceptance rate ({rule})."
-        )
-    if n_in:
-        lost = round(row["frr"] * n_in)
-        said.append(
-            f"False rejection rate {rate(row, 'frr')}: {lost} of {n_in} in-map test frames."
-        )
-    else:
-        said.append("The test split holds no in-map frame, so there is no false rejection rate.")
-    return said + _delays(row)
+    said.append(
+        f"False acceptance rate {rate(row, 'far')}: {round(row['far'] * n_out)} of {n_out} map-out "
+        f"test frames (prevalence {row['prevalence_test']:.2f}) lie at or below {rule}."
+    )
+    return said
+
+
+def _false_rejection(judgement: Judgement) -> list[str]:
+    row = metric_row(judgement, "fused")
+    if np.isnan(row["threshold"]):
+        return []
+    n_in = int(row["n_in_test"])
+    if not n_in:
+        said = "The test split holds no in-map frame, so there is no false rejection rate."
+        return [said, *_delays(row)]
+    said = (
+        f"False rejection rate {rate(row, 'frr')}: {round(row['frr'] * n_in)} of {n_in} in-map "
+        "test frames."
+    )
+    return [said, *_delays(row)]
 
 
 def _delays(row: Mapping[str, Any]) -> list[str]:
@@ -135,7 +146,7 @@ def _failures(judgement: Judgement) -> list[str]:
     for frames in stretches[:_MOST_STRETCHES]:
         x, y = np.median(judgement.query_m[frames], axis=0)
         which = f"frames {frames[0]} to {frames[-1]}" if len(frames) > 1 else f"frame {frames[0]}"
-        told.append(f"{which} near x = {x:.0f} m, y = {y:.0f} m")
+        told.append(f"{which} near x = {round(x)} m, y = {round(y)} m")
     more = len(stretches) - len(told)
     tail = (
         f"; and {more} more stretch{'es' if more > 1 else ''} as short or shorter" if more else ""
@@ -156,7 +167,7 @@ def _errors(judgement: Judgement) -> list[str]:
     return [
         f"Where {n} in-map test frames were accepted, the pose is off by "
         f"{table['median_m'][0]:.2f} m in the median and {table['p95_m'][0]:.2f} m at the 95th "
-        f"percentile; {table['share_within'][0]:.1%} lie within {within:g} m."
+        f"percentile; {100 * table['share_within'][0]:.1f} % lie within {within:g} m."
     ]
 
 
@@ -169,19 +180,31 @@ def _clock(judgement: Judgement) -> list[str]:
     ]
 
 
+_LEAD = (_counts, _false_acceptance, _failures)
+
+
+def lead_words(judgement: Judgement) -> tuple[str, ...]:
+    """Return what the first screen says: what was found, how safe it is, where it fails."""
+    return tuple(sentence for part in _LEAD for sentence in part(judgement))
+
+
 def find_words(judgement: Judgement) -> tuple[str, ...]:
-    """Return what was found, most important first."""
-    parts = (_counts, _operating, _failures, _errors, _separation)
-    said = [sentence for part in parts for sentence in part(judgement)]
+    """Return what was found, most important first; it begins with `lead_words`."""
+    said = [
+        sentence
+        for part in (_false_rejection, _errors, _separation)
+        for sentence in part(judgement)
+    ]
     promised = f"Conformal threshold of tao: {judgement.promise.sentence}"
-    return (*said, judgement.detector.note, promised, *_clock(judgement))
+    lead = lead_words(judgement)
+    return (*lead, *said, judgement.detector.note, promised, *_clock(judgement))
 
 
 def terminal_table(judgement: Judgement) -> str:
     """Return the main signals as aligned text of at most 80 characters."""
     columns = ("auroc", "far_at_95", "auroc_test", "threshold", "far", "frr", "delay_frames")
     lines = [f"{'signal':<10}" + "".join(f"{name:>13}" for name in columns[:-1]) + f"{'delay':>8}"]
-    for signal in ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused"):
+    for signal in MAIN:
         row = metric_row(judgement, signal)
         cells = ["-" if np.isnan(row[name]) else f"{row[name]:.3f}" for name in columns]
         lines.append(f"{signal:<10}" + "".join(f"{c:>13}" for c in cells[:-1]) + f"{cells[-1]:>8}")

@@ -3,14 +3,13 @@
 import shutil
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from taojax.specs import GZIP, MAX_BYTES, fail, load_spec, read_npy
+from taojax.specs import ARRAY_FAULTS, GZIP, MAX_BYTES, fail, first_line, load_spec, read_npy
 
 __all__ = ["blocks", "check_begin", "check_kind", "map_archive", "map_npy", "spool"]
 
@@ -87,10 +86,8 @@ def map_archive(path: Path, spec: str) -> dict[str, np.ndarray]:
             held = {name.removesuffix(".npy") for name in archive.namelist()}
             for name in held & {one["name"] for one in wanted}:
                 found[name] = _unpack(archive, name)
-    except (ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError,
-            zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
-        lines = str(error).splitlines() or [type(error).__name__]
-        what = f"is not a plain npz archive ({lines[0][:80]})"
+    except ARRAY_FAULTS as error:
+        what = f"is not a plain npz archive ({first_line(error)})"
         raise fail(path, what, "save it with np.savez, names as text") from error
     for one in wanted:
         array = found.get(one["name"])

@@ -71,6 +71,9 @@ def _read_rows(path: Path, topic: str | None) -> tuple[list[_Row], str]:
         ) from error
     if not path.exists():
         raise fail(path, "no such file", "add it or point at another bag")
+    if not path.is_dir() and not path.is_file():
+        # A pipe or a device may never end.
+        raise fail(path, "is a pipe or device", "point at a bag")
     # ROS 1 splits long recordings into files; a ROS 2 folder has its own table of contents.
     parts = sorted(path.glob("*.bag")) if path.is_dir() else []
     store = get_typestore(Stores.LATEST)

@@ -93,7 +93,7 @@ def joint_params(config: StreamConfig, tables: MapTables) -> JointParams:
     )
 
 
-def _seeds(
+def seeds_of(
     config: StreamConfig, tables: MapTables, index: Int[Array, " c"], carried: Float[Array, "2 3"]
 ) -> Float[Array, "s 3"]:
     """Return the newest candidates' map poses in both travel directions, and the carried poses."""
@@ -137,7 +137,7 @@ def joint_step(
     window = JointWindow(p, decay / over_frames(decay), listed, similarity, pooled)
 
     carried = compose(state.carried, jnp.broadcast_to(odometry, (2, 3)))
-    seeds = _seeds(config, tables, index, carried)
+    seeds = seeds_of(config, tables, index, carried)
     n_lists = min(config.joint_seeds, index.shape[0])
     is_seed = index[:n_lists] >= 0
     # Without any candidate and history the first anchor is as good a guess as any.

@@ -1,6 +1,8 @@
 """The way in: sensor files become checked arrays here, and are believed from here on."""
 
 import dataclasses
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -153,6 +155,17 @@ def _load_retrievals(path: Path, n_map: int, n_query: int, odometry: Path) -> Re
     return Retrievals(index.astype(np.int32), np.minimum(similarity, 1.0))
 
 
+def _refuse_truth(folder: Path, names: Sequence[str]) -> None:
+    """Refuse files that are links into truth/: what the robot reads must not come from there."""
+    truth = Path(os.path.realpath(folder / "truth"))
+    for name in names:
+        if Path(os.path.realpath(folder / name)).is_relative_to(truth):
+            raise InputError(
+                f"{folder / name}: is a link into {truth}, which only the judge may read; store the"
+                " file itself"
+            )
+
+
 def load_observations(folder: Path) -> Observations:
     """Load and check a data folder; the only reader of sensor files. Never looks into truth/.
 
@@ -165,6 +178,8 @@ def load_observations(folder: Path) -> Observations:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such data folder; see data_specs/README.md for the layout")
     files = ["map/poses.csv", "query/odometry.csv"]
+    views = ("query/retrievals.npz", *(name for pair in DESCRIPTORS for name in pair))
+    _refuse_truth(folder, [*files, *views, "about.toml"])
     map_poses = read_table(folder / files[0], "map_poses")
     odometry = read_table(folder / files[1], "query_odometry")
     n_map, n_query = len(map_poses["t_s"]), len(odometry["t_s"])

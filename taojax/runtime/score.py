@@ -13,6 +13,7 @@ from tqdm import tqdm
 from taojax import __version__
 from taojax.config import Config, replace, to_toml
 from taojax.detector import Detector, probability
+from taojax.detector import to_toml as detector_toml
 from taojax.errors import InputError
 from taojax.records import digest, refuse_if_taken, write_run
 from taojax.runtime.maps import MapTables, map_tables
@@ -27,6 +28,7 @@ from taojax.runtime.stream import (
     replay,
 )
 from taojax.runtime.trials import in_trials, replay_trials
+from taojax.specs import read_bytes
 
 CHUNK_FRAMES = 256
 """Frames per scan; one compilation, and a progress bar that moves."""
@@ -113,6 +115,15 @@ def facts_of(command: str, dataset: Path, seed: int) -> dict[str, Any]:
     }
 
 
+def map_facts(tables: MapTables) -> dict[str, Any]:
+    """Return what the manifest says of the map, so that its tables need no descriptors again."""
+    return {
+        "map_spacing_m": float(tables.spacing_m),
+        "map_scale": [float(end) for end in tables.scale],
+        "map_recall": float(tables.recall),
+    }
+
+
 def decide(detector: Detector, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the columns of decisions.csv: run-time verdicts at frozen numbers.
 
@@ -181,7 +192,9 @@ def score(
     return write_run(
         out,
         signals=table,
+        odometry=read_bytes(dataset / "query/odometry.csv"),
         decisions=None if detector is None else decide(detector, table),
+        detector_toml=None if detector is None else detector_toml(detector),
         tracks=tracks,
         map_poses=observations.map_poses,
         index=index,
@@ -190,7 +203,8 @@ def score(
         manifest={
             **facts_of(command, dataset, config.seed),
             "notes": list(observations.notes),
-            "map_recall": float(tables.recall),
+            **map_facts(tables),
+            "trial_frames": n,
             "sha256": observations.sha256,
         },
     )

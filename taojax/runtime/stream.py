@@ -176,7 +176,7 @@ def _push(window: Array, newest: Array) -> Array:
     return jnp.concatenate([window[1:], newest[None]])
 
 
-def _clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array, Array, Array]:
+def clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array, Array, Array]:
     """Return odometry, index and similarity of the K branches with every defect made harmless.
 
     A frame whose odometry is not finite stands still and has no candidates, so that it can hurt
@@ -213,7 +213,7 @@ def step(
     Raises:
         Nothing. Inputs are checked once, at the door, by `load_observations`.
     """
-    odometry, index, similarity = _clean(config, tables, frame)
+    odometry, index, similarity = clean(config, tables, frame)
     is_there = index >= 0
     anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
     p = _push(transform(inverse(odometry)[None], state.p), jnp.zeros(2))

@@ -1,0 +1,88 @@
+"""What the words of a report mean, in one place."""
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import NamedTuple
+
+from taojax.specs import load_spec
+
+_ABSTAINED = "; frames on which the verdict abstains are counted by their probability too"
+
+
+class Piece(NamedTuple):
+    """A part of a sentence; a defined word carries what hovering tells."""
+
+    text: str
+    title: str = ""
+
+
+@cache
+def about(column: str, spec: str = "metrics") -> str:
+    """Return the definition of a column as its spec gives it."""
+    return next(c["about"] for c in load_spec(spec)["columns"] if c["name"] == column)
+
+
+@cache
+def glossary() -> Mapping[str, str]:
+    """Return word -> definition; numbers are defined where their spec defines them."""
+    return {
+        "accepted": "verdict accept: the probability of being off the map is at or below the "
+        "frozen threshold, and the newest frame supports the place",
+        "rejected": "verdict reject: the probability of being off the map exceeds the frozen "
+        "threshold",
+        "abstained": "verdict abstain: there is no pose to judge (warming up, degenerate window, "
+        "no candidate, lost), or the newest frame does not support it",
+        "in-map": "a frame whose true position lies within r_in of a map pose",
+        "map-out": "a frame whose true position lies farther than r_out from every map pose",
+        "off the map": "map-out: the true position lies farther than r_out from every map pose",
+        "grey": "frames between r_in and r_out: neither in-map nor map-out, so not scored",
+        "wrong place": "the frame is map-out, or the answered pose lies more than 2 r_in from the "
+        "truth",
+        "calibration split": "the first part of the recording; thresholds and the probability "
+        "are fitted on it and then frozen",
+        "test frames": "the last part of the recording, one window after the calibration split; "
+        "only scored, never fitted on",
+        "False acceptance rate": about("far") + _ABSTAINED,
+        "FAR": about("far") + _ABSTAINED,
+        "False rejection rate": about("frr") + _ABSTAINED,
+        "FRR": about("frr") + _ABSTAINED,
+        "first rejection": about("delay_frames"),
+        "AUROC": about("auroc"),
+        "AUPR": about("aupr_out"),
+        "FAR at 95 %": about("far_at_95"),
+        "prevalence": about("prevalence_test"),
+        "threshold": about("threshold"),
+        "probability": "calibrated probability of being map-out, from the sealed signals of the "
+        "frame alone; `fused` in tables and figures",
+        "95 % interval": "from a circular block bootstrap over time: whole blocks of frames are "
+        "drawn again, because neighbours repeat each other",
+        "tao": about("tao", "signals"),
+        "best similarity": about("top1", "signals"),
+        "velocity gate": about("velocity", "signals"),
+        "C_geom": about("c_geom", "signals"),
+        "Conformal threshold": "accept at or below it; chosen so that the false acceptance rate "
+        "stays under alpha in the stated share of recordings",
+        "median": "half of the values lie below",
+    }
+
+
+def marked(sentence: str, words: Mapping[str, str]) -> list[Piece]:
+    """Cut a sentence at its defined words; each is marked where it comes first.
+
+    Args:
+        sentence: plain text.
+        words: word -> definition; the longest match wins.
+    """
+    if not words:
+        return [Piece(sentence)]
+    longest = sorted(words, key=len, reverse=True)
+    pattern = re.compile(r"(?<![\w-])(" + "|".join(map(re.escape, longest)) + r")(?![\w-])")
+    pieces, end, told = [], 0, set()
+    for match in pattern.finditer(sentence):
+        if match[0] in told:
+            continue
+        told.add(match[0])
+        pieces += [Piece(sentence[end : match.start()]), Piece(match[0], words[match[0]])]
+        end = match.end()
+    return [piece for piece in (*pieces, Piece(sentence[end:])) if piece.text]

@@ -1,0 +1,150 @@
+"""What the page shows of every frame: route, window, candidates and terms, packed to be small."""
+
+import base64
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from taojax.audit.judgement import Judgement
+from taojax.audit.tables import FUSED
+from taojax.detector import log_odds_terms
+from taojax.plots import OUTCOMES
+from taojax.specs import load_spec
+
+MOST_FRAMES = 10_000
+"""Longer runs show every second, third, ... frame, and say so."""
+
+_CANDIDATE_BYTES = 800_000
+_LEAST_CANDIDATES = 5
+_LEVELS = 65_535
+
+
+def _packed(values: np.ndarray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
+
+
+def _floats(values: np.ndarray) -> str:
+    # Six decimals of a signal of 1 would be noise; float32 holds seven digits in four bytes.
+    with np.errstate(over="ignore"):
+        return _packed(values, "<f4")
+
+
+def _letters(values: np.ndarray, names: Mapping[str, str]) -> str:
+    return "".join(names[str(value)] for value in values)
+
+
+def _candidates(
+    index: Int[np.ndarray, "t k"], similarity: Float[np.ndarray, "t k"]
+) -> dict[str, Any]:
+    """Pack the best candidates: rows of the map counted from 1 (0 = none), similarities scaled."""
+    room = _CANDIDATE_BYTES * 3 // 4 // (4 * max(1, len(index)))
+    k = min(index.shape[1], max(_LEAST_CANDIDATES, room))
+    rows, alike = index[:, :k] + 1, similarity[:, :k].astype(float)
+    known = alike[rows > 0]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    share = np.clip((np.where(rows > 0, alike, low) - low) / ((high - low) or 1.0), 0.0, 1.0)
+    is_wide = bool(rows.size and rows.max() > _LEVELS)
+    return {
+        "k": k,
+        "of": index.shape[1],
+        "low": low,
+        "high": high,
+        "wide": is_wide,
+        "row": _packed(rows, "<u4" if is_wide else "<u2"),
+        "alike": _packed(np.round(share * _LEVELS), "<u2"),
+    }
+
+
+def _model(judgement: Judgement, names: list[str]) -> dict[str, Any]:
+    """Return what turns signals into log odds, and the mean in-map terms to hold them against."""
+    detector, fitted = judgement.detector, judgement.splits.calibration
+    inside = {name: fitted.signals[name][fitted.is_in] for name in detector.columns}
+    level = np.zeros(len(detector.columns))
+    if fitted.is_in.any():
+        level = log_odds_terms(detector, inside).mean(axis=0)
+    return {
+        "columns": [names.index(name) for name in detector.columns],
+        "mean": detector.mean.tolist(),
+        "scale": detector.scale.tolist(),
+        "weight": detector.weight.tolist(),
+        "level": level.tolist(),
+        "threshold": None if np.isnan(detector.threshold) else float(detector.threshold),
+    }
+
+
+def _signals(judgement: Judgement) -> list[dict[str, Any]]:
+    """Return name, unit, meaning and frozen threshold of every signal."""
+    specs = {c["name"]: c for c in load_spec("signals")["columns"] if c.get("signal")}
+    table, found = judgement.metrics, []
+    for name, threshold in zip(table["signal"], table["threshold"], strict=True):
+        spec = specs.get(str(name), {"about": "calibrated probability of being map-out"})
+        found.append(
+            {
+                "name": str(name),
+                "unit": spec.get("unit", "1"),
+                "about": spec.get("about", ""),
+                "threshold": None if np.isnan(threshold) else float(threshold),
+            }
+        )
+    return found
+
+
+def route_json(
+    judgement: Judgement, index: Int[np.ndarray, "t k"], similarity: Float[np.ndarray, "t k"]
+) -> str:
+    """Return what the page's script reads, as JSON that may stand inside HTML.
+
+    Args:
+        judgement: of the run.
+        index: sealed map rows per frame, best first, -1 = no candidate.
+        similarity: sealed similarities.
+
+    Returns:
+        Numbers as base64 of little-endian arrays, positions in metres from `origin`.
+    """
+    signals = _signals(judgement)
+    names = [signal["name"] for signal in signals]
+    every = -(-len(judgement.label) // MOST_FRAMES)
+    shown = slice(None, None, every)
+    origin = np.floor(judgement.map_m.min(axis=0))
+    columns = judgement.signals | {FUSED: judgement.verdicts["probability_map_out"]}
+    pose = np.stack([judgement.signals["x_m"], judgement.signals["y_m"]], axis=1).astype(float)
+    status, status_at = np.unique(judgement.signals["status"].astype(str), return_inverse=True)
+    reason, reason_at = np.unique(
+        judgement.verdicts["reason"][shown].astype(str), return_inverse=True
+    )
+    kinds = list(OUTCOMES)
+    table = np.stack([np.asarray(columns[name], dtype=float)[shown] for name in names])
+    held = {
+        "frames": len(judgement.label),
+        "every": every,
+        "window": judgement.config.stream.window,
+        "origin": origin.tolist(),
+        "map": _floats(judgement.map_m - origin),
+        "truth": _floats(judgement.query_m[shown] - origin),
+        "pose": _floats(pose[shown] - origin),
+        "nearest": _floats(judgement.nearest_m[shown]),
+        "error": _floats(judgement.error_m[shown]),
+        "verdict": _letters(
+            judgement.verdicts["verdict"][shown], {"accept": "a", "reject": "r", "abstain": "-"}
+        ),
+        "label": _letters(judgement.label[shown], {"in_map": "i", "map_out": "o", "grey": "g"}),
+        "split": _letters(
+            judgement.splits.name[shown], {"calibration": "c", "gap": "g", "test": "t"}
+        ),
+        "kinds": [{"name": n, "label": m.label, "marker": m.marker} for n, m in OUTCOMES.items()],
+        "kind": "".join(str(kinds.index(str(o))) for o in judgement.outcome[shown]),
+        "statuses": status.tolist(),
+        "status": "".join(str(at) for at in status_at[shown]),
+        "reasons": reason.tolist(),
+        "reason": reason_at.tolist(),
+        "signals": signals,
+        "values": _floats(table),
+        "model": _model(judgement, names),
+        "candidates": _candidates(index[shown], similarity[shown]),
+    }
+    # `<` could end the script element that holds this.
+    return json.dumps(held, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

@@ -1,0 +1,273 @@
+"""Loop closures as files that other tools read: g2o for pose graphs, TUM for trajectories.
+
+Ids of the graph: map row m is vertex m, query frame t is vertex M + t. Every edge is an EDGE_SE2:
+the pose of the second vertex in axes of the first, then the upper triangle of its information
+matrix. There are no comments and no FIX lines, which some readers refuse.
+"""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from taojax.config import StreamConfig, from_toml
+from taojax.detector import Detector
+from taojax.detector import from_toml as read_detector
+from taojax.errors import InputError
+from taojax.records import Run
+from taojax.specs import fail, read_text
+from taojax.tables import read_table
+
+__all__ = ["Graph", "Verdicts", "build_graph", "g2o_text", "read_verdicts", "tum_text"]
+
+MAP_STIFFNESS = 100.0
+"""Edges between neighbouring map poses are so many times tighter than a closure: the map stays."""
+
+ODOMETRY_SHARE = 0.1
+"""Standard deviation of an odometry edge, of the distance driven."""
+
+LEAST_SPACINGS = 0.01
+"""It is never less than so much of the map's spacing."""
+
+ODOMETRY_RAD = 0.02
+"""Standard deviation of its turn [rad]."""
+
+
+class Verdicts(NamedTuple):
+    """What was decided of every frame of a run."""
+
+    source: str
+    """The file that says so."""
+
+    verdict: Shaped[np.ndarray, " t"]
+    """accept, reject or abstain."""
+
+    probability: Float[np.ndarray, " t"]
+    """Of being off the map; NaN where the file leaves it blank."""
+
+    reason: Shaped[np.ndarray, " t"] | None
+    """In words; None where the file has none."""
+
+    detector: Detector | None
+    """The frozen numbers behind the verdicts; None where no threshold could be set."""
+
+
+class Graph(NamedTuple):
+    """Map, query frames and what ties them."""
+
+    map_pose: Float[np.ndarray, "m 3"]
+    """x [m], y [m], theta [rad]."""
+
+    query_pose: Float[np.ndarray, "t 3"]
+    """Accepted poses, and between them what odometry makes of the last one."""
+
+    t_s: Float[np.ndarray, " t"]
+    odometry: Float[np.ndarray, "t 3"]
+    is_start: Bool[np.ndarray, " t"]
+    """No odometry edge leads into this frame."""
+
+    pose: Float[np.ndarray, "t 3"]
+    """Answered pose of every frame; NaN without one."""
+
+    map_index: Int[np.ndarray, " t"]
+    verdict: Shaped[np.ndarray, " t"]
+    sigma_m: float
+    """Standard deviation of a closure's position: the Huber threshold of this map."""
+
+    sigma_rad: float
+    """Of its angle: the Huber threshold over the length of a window."""
+
+    spacing_m: float
+
+    def rows(self, verdict: str) -> Int[np.ndarray, " c"]:
+        """Return the frames with one verdict and a pose."""
+        return np.flatnonzero((self.verdict == verdict) & (self.map_index >= 0))
+
+
+def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
+    """Read what was decided: sealed at run time, else by the judge.
+
+    Args:
+        folder: the run.
+        run: read from it by `read_run`.
+
+    Returns:
+        None where nobody decided.
+
+    Raises:
+        InputError: a file is malformed, or speaks of another run.
+    """
+    hashes, n_frames = run.manifest["sha256"], len(run.signals["frame"])
+    if "decisions.csv" in hashes:
+        table = read_table(folder / "decisions.csv", "decisions")
+        has_numbers = "detector.toml" in hashes
+        detector = read_detector(folder / "detector.toml") if has_numbers else None
+        p = table["probability_map_out"].astype(float)
+        return Verdicts("decisions.csv", table["verdict"], p, None, detector)
+    path = folder / "verdicts.csv"
+    if not path.is_file():
+        return None
+    table = read_table(path, "verdicts")
+    try:
+        seal = json.loads(read_text(folder / "audit.json"))["run_seal"]
+    except (ValueError, KeyError, TypeError) as error:
+        what = "does not say which run was judged"
+        raise fail(folder / "audit.json", what, "judge the run again") from error
+    if seal != run.manifest["seal"] or len(table["frame"]) != n_frames:
+        raise fail(path, "speaks of another run", "judge this one again with `taojax evaluate`")
+    numbers = folder / "calibration.toml"
+    detector = read_detector(numbers) if numbers.is_file() else None
+    p = table["probability_map_out"].astype(float)
+    return Verdicts("verdicts.csv", table["verdict"], p, table["reason"], detector)
+
+
+def _wrap(angle: np.ndarray | float) -> np.ndarray:
+    return np.asarray(np.arctan2(np.sin(angle), np.cos(angle)))
+
+
+def _compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return pose `b`, given in axes of `a`, in the frame of `a`; float64."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x, y = b[..., 0], b[..., 1]
+    theta = _wrap(a[..., 2] + b[..., 2])
+    return np.stack([a[..., 0] + c * x - s * y, a[..., 1] + s * x + c * y, theta], axis=-1)
+
+
+def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return pose `b` in axes of `a`."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x, y = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return np.stack([c * x + s * y, c * y - s * x, _wrap(b[..., 2] - a[..., 2])], axis=-1)
+
+
+def _chained(odometry: np.ndarray, known: np.ndarray, is_start: np.ndarray) -> np.ndarray:
+    """Return a pose for every frame: the known ones, and odometry from the last of them.
+
+    Frames before the first known pose are found backwards from it; a stretch without any starts at
+    the origin.
+    """
+    out = np.zeros_like(known)
+    has = np.isfinite(known[:, 0])
+    starts = np.flatnonzero(is_start)
+    for first, end in zip(starts, [*starts[1:], len(known)], strict=True):
+        inside = first + np.flatnonzero(has[first:end])
+        anchor = int(inside[0]) if inside.size else int(first)
+        out[anchor] = known[anchor] if inside.size else 0.0
+        for t in range(anchor, first, -1):
+            still = _between(odometry[t], np.zeros(3))
+            out[t - 1] = _compose(out[t], still)
+        for t in range(anchor + 1, end):
+            out[t] = known[t] if has[t] else _compose(out[t - 1], odometry[t])
+    return out
+
+
+def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
+    """Put together what the files say.
+
+    Args:
+        folder: the run.
+        run: read from it by `read_run`.
+        verdicts: from `read_verdicts`.
+
+    Raises:
+        InputError: the run was sealed without its odometry.
+    """
+    facts = run.manifest
+    if "odometry.csv" not in facts["sha256"] or "map_spacing_m" not in facts:
+        what = "lacks odometry.csv or map_spacing_m, sealed by newer versions"
+        raise InputError(f"{folder}: {what}; score the data set again with `taojax score`")
+    table = read_table(folder / "odometry.csv", "query_odometry")
+    odometry = np.stack([table[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
+    signals, poses = run.signals, run.map_poses
+    pose = np.stack([signals[c].astype(float) for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    is_accepted = (verdicts.verdict == "accept") & np.isfinite(pose[:, 0])
+    n = len(odometry)
+    is_start = np.arange(n) % (facts.get("trial_frames") or n) == 0
+    settings: StreamConfig = from_toml(folder / "config.toml").stream
+    spacing_m = float(facts["map_spacing_m"])
+    delta = float(settings.delta_spacings)
+    return Graph(
+        map_pose=np.stack([poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1),
+        query_pose=_chained(odometry, np.where(is_accepted[:, None], pose, np.nan), is_start),
+        t_s=table["t_s"],
+        odometry=odometry,
+        is_start=is_start,
+        pose=pose,
+        map_index=signals["map_index"].astype(int),
+        verdict=verdicts.verdict,
+        sigma_m=delta * spacing_m,
+        sigma_rad=delta / settings.window,
+        spacing_m=spacing_m,
+    )
+
+
+def _lines(tag: str, *columns: np.ndarray) -> list[str]:
+    rows = np.column_stack([np.asarray(column, dtype=object) for column in columns])
+    return [
+        " ".join([tag, *(str(v) if isinstance(v, int) else f"{v:.9g}" for v in row)])
+        for row in rows.tolist()
+    ]
+
+
+def _edges(
+    a: np.ndarray, b: np.ndarray, motion: np.ndarray, sigma_m: np.ndarray | float, sigma_rad: float
+) -> list[str]:
+    position = 1.0 / np.broadcast_to(sigma_m, len(a)) ** 2
+    zero = np.zeros(len(a))
+    angle = zero + 1.0 / sigma_rad**2
+    return _lines("EDGE_SE2", a, b, motion, position, zero, zero, position, zero, angle)
+
+
+def g2o_text(graph: Graph, verdict: str) -> str:
+    """Return a pose graph: map, query frames, odometry, and the closures with one verdict.
+
+    Args:
+        graph: from `build_graph`.
+        verdict: accept, or reject for a graph to compare with; never optimise that one.
+
+    Returns:
+        A g2o file. Information matrices are diagonal: 1 / delta^2 for the position of a closure,
+        where delta is the Huber threshold (3 map spacings), and (window / delta_spacings)^2 for its
+        angle; the map's own edges are `MAP_STIFFNESS` times tighter in standard deviation; an
+        odometry edge takes 10 % of its length, at least 1 % of the spacing, and `ODOMETRY_RAD`.
+        Put your own covariance there if you have one.
+    """
+    n_map, n_query = len(graph.map_pose), len(graph.query_pose)
+    rows, after = graph.rows(verdict), np.flatnonzero(~graph.is_start)
+    driven = np.hypot(graph.odometry[after, 0], graph.odometry[after, 1])
+    slack = np.maximum(ODOMETRY_SHARE * driven, LEAST_SPACINGS * graph.spacing_m)
+    m, place = np.arange(n_map), graph.map_index[rows]
+    lines = [
+        *_lines("VERTEX_SE2", m, graph.map_pose),
+        *_lines("VERTEX_SE2", n_map + np.arange(n_query), graph.query_pose),
+        *_edges(
+            m[:-1], m[1:], _between(graph.map_pose[:-1], graph.map_pose[1:]),
+            graph.sigma_m / MAP_STIFFNESS, graph.sigma_rad / MAP_STIFFNESS,
+        ),
+        *_edges(
+            n_map + after - 1, n_map + after, graph.odometry[after], slack, ODOMETRY_RAD
+        ),
+        *_edges(
+            place, n_map + rows, _between(graph.map_pose[place], graph.pose[rows]),
+            graph.sigma_m, graph.sigma_rad,
+        ),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def tum_text(graph: Graph) -> str:
+    """Return the accepted poses as a TUM trajectory: `t x y z qx qy qz qw`, one line each.
+
+    Of frames with one stamp the first is kept, because readers want stamps to rise.
+    """
+    rows = graph.rows("accept")
+    rows = rows[np.diff(graph.t_s[rows], prepend=-np.inf) > 0]
+    half = 0.5 * graph.pose[rows, 2]
+    zero = np.zeros(len(rows))
+    columns = (*graph.pose[rows, :2].T, zero, zero, zero, np.sin(half), np.cos(half))
+    return "".join(
+        " ".join([repr(float(t)), *(f"{v:.9g}" for v in row)]) + "\n"
+        for t, row in zip(graph.t_s[rows], np.stack(columns, axis=1), strict=True)
+    )

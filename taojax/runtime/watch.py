@@ -1,0 +1,271 @@
+"""A stream of JSON lines through `step`: one observation in, one answer out, for ever.
+
+A line that is not understood is answered by an error and changes nothing. Memory is constant.
+"""
+
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import partial
+from io import BufferedIOBase
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from taojax.config import StreamConfig
+from taojax.detector import Detector
+from taojax.errors import InputError
+from taojax.runtime.maps import MapTables, map_tables
+from taojax.runtime.observations import DESCRIPTORS, descriptor_names
+from taojax.runtime.reasons import STATUS_MEANS, reason
+from taojax.runtime.retrieval import N_KEPT
+from taojax.runtime.score import decide
+from taojax.runtime.stream import STATUSES, Frame, StreamRecord, init, step
+from taojax.specs import read_npy
+from taojax.tables import read_table
+
+MOST_BYTES = 1 << 20
+"""Longest line; what is longer is skipped up to its end, never held."""
+
+LIMIT = {"odometry": (1e5, 1e5, 1e4), "similarity": 1.0 + 1e-3, "rise": 1e-6}
+"""Ranges of data_specs/query_odometry.toml, and what `load_observations` asks of lists."""
+
+REMEMBERED = 100_000
+"""Latencies behind the summary: the last so many frames."""
+
+
+BLANK = b'{"odometry": [0, 0, 0], "index": [], "similarity": []}'
+"""An observation of nothing, to compile with."""
+
+
+class LineError(ValueError):
+    """A line is not an observation; the message says what is wrong with it."""
+
+
+class Observed(NamedTuple):
+    """One line, checked."""
+
+    t_s: float | None
+    odometry: Float[np.ndarray, "3"]
+    rows: Int[np.ndarray, " c"]
+    """Candidates, best first, -1 = none."""
+
+    similarity: Float[np.ndarray, " c"]
+
+
+def load_map(folder: Path, config: StreamConfig) -> tuple[MapTables, str]:
+    """Prepare the map of a folder, as `taojax score` does for the same folder.
+
+    Args:
+        folder: a data folder, or one that holds poses.csv and perhaps descriptors.npy.
+        config: settings.
+
+    Returns:
+        The map, and in words where its similarity scale comes from.
+
+    Raises:
+        InputError: no map there, or it does not meet its spec.
+    """
+    inner = folder / "map" if (folder / "map" / "poses.csv").is_file() else folder
+    table = read_table(inner / "poses.csv", "map_poses")
+    poses = np.stack([table[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    path = folder / descriptor_names(folder)[0]
+    if inner == folder and path == folder / DESCRIPTORS[0][0]:
+        path = folder / "descriptors.npy"
+    # Lists of another frontend have a scale of their own, which the map's descriptors do not tell.
+    if (folder / "query/retrievals.npz").is_file() or not path.is_file():
+        return map_tables(poses, config), "similarities are taken as they are (0 to 1)"
+    descriptors = read_npy(path, "descriptors")
+    if len(descriptors) != len(poses):
+        raise InputError(
+            f"{path}: {len(descriptors)} rows, but {inner / 'poses.csv'} has {len(poses)}; both "
+            "must describe the same frames"
+        )
+    return map_tables(poses, config, descriptors), f"similarity scale from {path}"
+
+
+def _not_json(text: str) -> float:
+    raise LineError(f"{text} is not a number")
+
+
+def _numbers(tree: dict[str, Any], name: str, kinds: tuple[type, ...]) -> list[Any]:
+    values = tree.get(name)
+    if not isinstance(values, list):
+        raise LineError(f"{name} is missing or no list")
+    for at, value in enumerate(values):
+        # bool is an int to Python.
+        if type(value) not in kinds or not math.isfinite(value):
+            want = "a whole number" if kinds == (int,) else "a finite number"
+            raise LineError(f"{name}[{at}] is not {want}")
+    return values
+
+
+def _check_list(index: list[int], similarity: list[float], n_map: int) -> None:
+    if len(index) != len(similarity):
+        raise LineError(f"index has {len(index)} entries and similarity {len(similarity)}")
+    least = math.inf
+    for at, (row, value) in enumerate(zip(index, similarity, strict=True)):
+        if not -1 <= row < n_map:
+            raise LineError(f"index[{at}] is {row}, but the map has rows 0 to {n_map - 1}")
+        if row < 0:
+            continue
+        if value > LIMIT["similarity"]:
+            raise LineError(f"similarity[{at}] is {value:g}; similarities are at most 1")
+        if value > least + LIMIT["rise"]:
+            raise LineError(f"similarity[{at}] rises; give candidates best first")
+        least = min(least, value)
+
+
+def parse(line: bytes, n_map: int) -> Observed:
+    """Read one line.
+
+    Args:
+        line: JSON, with `odometry` (forward m, left m, yaw rad), `index` and `similarity` (best
+            first, at most 100 are used, -1 = no candidate) and perhaps `t_s`.
+        n_map: rows of the map.
+
+    Raises:
+        LineError: saying what is wrong.
+    """
+    try:
+        tree = json.loads(line, parse_constant=_not_json)
+        if not isinstance(tree, dict):
+            raise LineError("is not a JSON object")
+        odometry = _numbers(tree, "odometry", (int, float))
+        index = _numbers(tree, "index", (int,))
+        similarity = _numbers(tree, "similarity", (int, float))
+        t_s = tree.get("t_s")
+        if t_s is not None and (type(t_s) not in (int, float) or not math.isfinite(t_s)):
+            raise LineError("t_s is not a finite number")
+        _check_list(index, similarity, n_map)
+        wide = len(odometry) != 3 or any(
+            abs(v) > most for v, most in zip(odometry, LIMIT["odometry"], strict=False)
+        )
+        if wide:
+            raise LineError("odometry is not [forward m, left m, yaw rad] within 1e5, 1e5 and 1e4")
+    except LineError:
+        raise
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise LineError(f"is not JSON ({str(error).splitlines()[0][:80]})") from error
+    rows, values = np.full(N_KEPT, -1, np.int32), np.zeros(N_KEPT, np.float32)
+    kept = min(len(index), N_KEPT)
+    rows[:kept], values[:kept] = index[:kept], similarity[:kept]
+    values = np.where(rows >= 0, np.minimum(values, 1.0), 0.0).astype(np.float32)
+    return Observed(t_s, np.array(odometry, np.float32), rows, values)
+
+
+def lines_of(stream: BinaryIO | BufferedIOBase) -> Iterator[bytes | None]:
+    """Go through the lines of a stream as they come; None stands for one that is too long."""
+    while line := stream.readline(MOST_BYTES + 1):
+        if len(line) <= MOST_BYTES:
+            yield line
+            continue
+        while line and not line.endswith(b"\n"):
+            line = stream.readline(MOST_BYTES)
+        yield None
+
+
+class Watch:
+    """A map, a state and what was seen so far; the first step is compiled when it is made.
+
+    The one place with a state that changes: a process that watches is one.
+    """
+
+    def __init__(
+        self, config: StreamConfig, tables: MapTables, detector: Detector | None = None
+    ) -> None:
+        """Compile the step.
+
+        Args:
+            config: settings.
+            tables: from `load_map`.
+            detector: frozen numbers; None = nothing is decided.
+        """
+        # The map stays an argument: folded into the program it compiles for longer, and rounds
+        # differently from `taojax score`.
+        self._advance = partial(step, config, tables)
+        self._detector = detector
+        self._n_map = tables.grid.xy.shape[0]
+        self._n_frames, self._state = 0, init(config, tables)
+        self.latencies_ms: deque[float] = deque(maxlen=REMEMBERED)
+        for _ in range(2):
+            self.answer(BLANK)
+        self._state, self._n_frames = init(config, tables), 0
+        self.latencies_ms.clear()
+
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """Take in one line and say what it means; a line that is no observation changes nothing.
+
+        Raises:
+            LineError: saying what is wrong with the line.
+        """
+        start = time.perf_counter()
+        seen = parse(line, self._n_map)
+        frame = Frame(*(jnp.asarray(leaf) for leaf in seen[1:]))
+        self._state, record = self._advance(self._state, frame)
+        said = self._said(seen.t_s, jax.device_get(record))
+        self._n_frames += 1
+        said["latency_ms"] = round(1e3 * (time.perf_counter() - start), 3)
+        self.latencies_ms.append(said["latency_ms"])
+        return said
+
+    def _said(self, t_s: float | None, record: StreamRecord) -> dict[str, Any]:
+        status = STATUSES[int(record.status)]
+        row = {name: float(value) for name, value in record.signals.items()}
+        verdict, p, why = None, None, STATUS_MEANS[status]
+        if self._detector is not None:
+            table = {name: np.array([value]) for name, value in row.items()}
+            table |= {"frame": np.array([0]), "status": np.array([status], dtype=object)}
+            decided = decide(self._detector, table)
+            verdict, p = str(decided["verdict"][0]), float(decided["probability_map_out"][0])
+            why = reason(self._detector, row, status, verdict, p)
+        return {
+            "frame": self._n_frames,
+            "t_s": t_s,
+            "status": status,
+            "verdict": verdict,
+            "map_index": int(record.map_index),
+            "pose": [short(v) for v in record.pose.tolist()] if record.has_pose else None,
+            "tao": short(row["tao"]),
+            "probability_map_out": None if p is None else short(p),
+            "reason": why,
+        }
+
+    def run(self, stream: BinaryIO | BufferedIOBase, write: Callable[[str], object]) -> None:
+        """Answer every line of a stream until it ends.
+
+        Args:
+            stream: of bytes; blank lines are passed over.
+            write: takes one line of JSON at a time.
+        """
+        for number, line in enumerate(lines_of(stream), start=1):
+            if line is not None and not line.strip():
+                continue
+            try:
+                if line is None:
+                    raise LineError(f"is longer than {MOST_BYTES} bytes")
+                said = self.answer(line)
+            except LineError as error:
+                said = {"line": number, "error": str(error)}
+            write(json.dumps(said))
+
+    def summary(self) -> str:
+        """Say how many frames were answered and how fast."""
+        if not self.latencies_ms:
+            return "0 frames answered"
+        p50, p99 = np.percentile(np.array(self.latencies_ms), (50, 99))
+        n = self._n_frames
+        return (
+            f"{n} frame{'s' if n > 1 else ''} answered; latency p50 {p50:.2f} ms, p99 {p99:.2f} ms"
+        )
+
+
+def short(value: float) -> float:
+    """Return a number with the nine digits that tables have."""
+    return float(f"{value:.9g}")

@@ -1,0 +1,57 @@
+"""`taojax closures`: accepted and rejected closures for pose-graph tools."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taojax.errors import InputError
+from taojax.verbs.common import flag, say
+
+
+@dataclasses.dataclass(frozen=True)
+class Closures:
+    """Write what was accepted and rejected as g2o and TUM, for GTSAM, g2o, RTAB-Map and evo.
+
+    Example: taojax closures runs/mine
+    """
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = tyro.MISSING
+    """Run folder with verdicts: audited, or scored with --calibration."""
+
+    out: Annotated[Path | None, flag("DIR", "RUN")] = None
+    """Where to write closures.g2o, rejected.g2o and trajectory.tum."""
+
+
+def run(args: Closures) -> None:
+    """Write the files."""
+    from taojax.closures import build_graph, g2o_text, read_verdicts, tum_text
+    from taojax.records import read_run
+    from taojax.specs import write_atomically
+
+    sealed = read_run(args.run)
+    verdicts = read_verdicts(args.run, sealed)
+    if verdicts is None:
+        raise InputError(
+            f"{args.run}: nothing is decided here; judge it with `taojax evaluate`, or score with"
+            " --calibration"
+        )
+    graph, folder = build_graph(args.run, sealed, verdicts), args.out or args.run
+    trajectory = tum_text(graph)
+    files = {
+        "closures.g2o": g2o_text(graph, "accept"),
+        "rejected.g2o": g2o_text(graph, "reject"),
+        "trajectory.tum": trajectory,
+    }
+    for name, text in files.items():
+        write_atomically(folder / name, text)
+    n_map, n_query = len(graph.map_pose), len(graph.query_pose)
+    n = {verdict: len(graph.rows(verdict)) for verdict in ("accept", "reject", "abstain")}
+    print(f"verdicts of {verdicts.source}; vertices 0 to {n_map - 1} are the map, "
+          f"{n_map} to {n_map + n_query - 1} the query frames")  # fmt: skip
+    print(f"closures.g2o    {n['accept']} accepted closures")
+    print(f"rejected.g2o    {n['reject']} rejected ones, to look at")
+    print(f"trajectory.tum  {trajectory.count(chr(10))} accepted poses")
+    print(f"left out        {n['abstain']} poses on which nothing was decided")
+    say(f"written to {folder}")

@@ -1,0 +1,132 @@
+"""`taojax explain`: why one frame was accepted, rejected or left open."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from taojax.verbs.common import flag, say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from taojax.records import Run
+    from taojax.runtime.explain import Look
+
+
+@dataclasses.dataclass(frozen=True)
+class Explain:
+    """Say why a frame got its verdict: signal, branch, disagreeing frames, margin, picture.
+
+    Example: taojax explain runs/mine --frame 812
+    """
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = tyro.MISSING
+    """Run folder made by `taojax score` or `taojax audit`."""
+
+    frame: Annotated[int, tyro.conf.arg(metavar="N")] = tyro.MISSING
+    """Row of signals.csv, from 0."""
+
+    out: Annotated[Path | None, flag("DIR", "RUN/explain")] = None
+    """Where to write frame_N.png, .svg and .csv."""
+
+    progress: bool = True
+    """Draw progress bars."""
+
+
+def run(args: Explain) -> None:
+    """Replay up to the frame, tell and draw."""
+    from taojax.closures import read_verdicts
+    from taojax.records import read_run
+    from taojax.runtime.explain import explain
+    from taojax.verbs.explain_page import headline, page
+
+    sealed = read_run(args.run)
+    verdicts = read_verdicts(args.run, sealed)
+    look = explain(args.run, sealed, args.frame, progress=args.progress)
+    if look.gap > 1.0:
+        _refuse(args.run, sealed, look)
+    print("\n".join(page(look, sealed, verdicts)))
+    stem = (args.out or args.run / "explain") / f"frame_{args.frame}"
+    _draw(stem, sealed, look, headline(look, verdicts))
+    say(f"picture: {stem}.png, .svg and .csv")
+
+
+def _refuse(folder: Path, sealed: "Run", look: "Look") -> None:
+    """Stop where the replay does not give what was sealed."""
+    from taojax.runtime.score import facts_of
+
+    here = facts_of("", folder, 0)
+    names = [name for name in ("device", "versions", "code") if sealed.manifest[name] != here[name]]
+    differs = f"here differ {', '.join(names)}" if names else "device, versions and code are equal"
+    say(
+        f"taojax: {folder}: frame {look.frame} replayed gives tao {look.signals['tao']:.6g} where "
+        f"{look.sealed['tao']:.6g} is sealed, so nothing can be explained ({differs}); score again"
+    )
+    raise SystemExit(1)
+
+
+def _draw(stem: Path, sealed: "Run", look: "Look", headline: str) -> None:
+    """Write the picture three ways."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    from taojax.audit.figures import picture
+    from taojax.specs import write_atomically
+    from taojax.tables import table_text
+    from taojax.window_plot import WindowMarks, draw_window
+
+    map_m = np.stack([sealed.map_poses[c] for c in ("x_m", "y_m")], axis=1)
+    window, branches = look.window, look.branches
+    has = (window.anchor >= 0)[:, None]
+    anchor_m = np.where(has, map_m[np.maximum(window.anchor, 0)], np.nan)
+    marks = WindowMarks(
+        map_m, window.path_m, anchor_m, window.is_inlier, map_m[look.candidate],
+        branches.pose.astype(float), branches.cost.astype(float),
+    )  # fmt: skip
+    figure = Figure(figsize=(11.0, 6.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    draw_window(marks, is_close=True, ax=left).set_title("the window", fontsize=10)
+    draw_window(marks, is_close=False, ax=right).set_title("the map", fontsize=10)
+    figure.suptitle(headline, fontsize=11)
+    labels = {
+        label: handle
+        for ax in (left, right)
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        labels.values(), labels.keys(), loc="outside lower center", ncols=3, frameon=False,
+        fontsize=8,
+    )  # fmt: skip
+    drawn = picture(figure, stem.name, "", "", table_text("explain", _rows(look, map_m, anchor_m)))
+    for suffix, content in ((".png", drawn.png), (".svg", drawn.svg), (".csv", drawn.csv)):
+        write_atomically(stem.with_suffix(suffix), content)
+
+
+def _rows(look: "Look", map_m: "np.ndarray", anchor_m: "np.ndarray") -> "dict[str, np.ndarray]":
+    """Return the columns of data_specs/explain.toml: frames, then candidates, then branches."""
+    import numpy as np
+
+    window, branches = look.window, look.branches
+    n, c, k = len(window.frame), len(look.candidate), len(branches.cost)
+    # One column from its part of each kind; None is blank.
+    joined = lambda *parts: np.concatenate(
+        [np.full(size, np.nan) if part is None else np.asarray(part, float)
+         for part, size in zip(parts, (n, c, k), strict=True)]
+    )  # fmt: skip
+    candidate_m, pose = map_m[look.candidate], branches.pose
+    return {
+        "kind": np.array(["frame"] * n + ["candidate"] * c + ["branch"] * k, dtype=object),
+        "number": joined(window.frame, np.arange(1, c + 1), np.arange(1, k + 1)),
+        "x_m": joined(window.path_m[:, 0], candidate_m[:, 0], pose[:, 0]),
+        "y_m": joined(window.path_m[:, 1], candidate_m[:, 1], pose[:, 1]),
+        "theta_rad": joined(None, None, pose[:, 2]),
+        "map_index": joined(window.anchor, look.candidate, None),
+        "map_x_m": joined(anchor_m[:, 0], candidate_m[:, 0], None),
+        "map_y_m": joined(anchor_m[:, 1], candidate_m[:, 1], None),
+        "cost": joined(window.cost, None, branches.cost),
+        "weight": joined(window.weight, None, None),
+        "similarity": joined(None, look.similarity, None),
+        "agrees": joined(window.is_inlier, None, None),
+    }

@@ -1,0 +1,260 @@
+"""What `taojax explain` prints: one frame in plain words."""
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taojax.runtime.reasons import STALE, STATUS_MEANS, signal_terms
+
+if TYPE_CHECKING:
+    from taojax.closures import Verdicts
+    from taojax.detector import Detector
+    from taojax.records import Run
+    from taojax.runtime.explain import Look
+
+WIDTH = 92
+LABEL = 10
+
+N_COSTS = 12
+"""Frame costs printed one by one, newest first."""
+
+
+def page(look: "Look", run: "Run", verdicts: "Verdicts | None") -> list[str]:
+    """Return the lines to print.
+
+    Args:
+        look: from `taojax.runtime.explain`.
+        run: the sealed run.
+        verdicts: what was decided, if anything was.
+    """
+    parts = [
+        ("frame", _frame(look, run)),
+        ("verdict", _verdict(look, verdicts)),
+        ("decided by", _decided(look, verdicts)),
+        ("tao", _tao(look)),
+        ("place", _place(look)),
+        ("branch", _branch(look)),
+        ("window", _window(look)),
+        ("costs", _costs(look)),
+        ("support", _support(look)),
+        ("rival", _rival(look)),
+        ("list", _list(look)),
+        ("margin", _margin(look, run, verdicts)),
+    ]
+    lines = []
+    for label, words in parts:
+        if words:
+            indent = " " * (LABEL + 2)
+            lines += textwrap.wrap(
+                words, WIDTH, initial_indent=f"{label:<{LABEL}}  ", subsequent_indent=indent
+            )
+    return lines
+
+
+def headline(look: "Look", verdicts: "Verdicts | None") -> str:
+    """Return one line over the picture."""
+    said = f"frame {look.frame}: {look.status}, tao {look.signals['tao']:.3f}"
+    if verdicts is None:
+        return said
+    said = f"frame {look.frame}: {verdicts.verdict[look.frame]}, {look.status}"
+    p = verdicts.probability[look.frame]
+    if verdicts.detector is None or not np.isfinite(p):
+        return said
+    limit = verdicts.detector.threshold
+    return f"{said}, probability of being off the map {p:.3f} (threshold {limit:.3f})"
+
+
+def _frame(look: "Look", run: "Run") -> str:
+    n, t_s = len(run.signals["frame"]), run.signals["t_s"][look.frame]
+    difference = abs(look.signals["tao"] - look.sealed["tao"])
+    how = "bit for bit" if difference == 0 else f"to {difference:.1g}"
+    return (
+        f"{look.frame} of 0 to {n - 1} (t = {float(t_s):.10g} s); the seal holds, and the replay "
+        f"gives the sealed tao {how}"
+    )
+
+
+def _verdict(look: "Look", verdicts: "Verdicts | None") -> str:
+    means = STATUS_MEANS[look.status]
+    why = f"{look.status}: {means}" if means else look.status
+    if verdicts is None:
+        return f"none: nobody decided in this run; status {why}"
+    p, verdict = verdicts.probability[look.frame], verdicts.verdict[look.frame]
+    said = f"{verdict} ({verdicts.source}); status {why}"
+    if verdicts.detector is not None and np.isfinite(p):
+        threshold = verdicts.detector.threshold
+        side = "above" if p > threshold else "below"
+        said += (
+            f"; probability of being off the map {p:.4f}, {abs(p - threshold):.4f} {side} the "
+            f"threshold {threshold:.4f}"
+        )
+    if verdict == "abstain" and look.status == "ok":
+        said += f"; {STALE}"
+    return said
+
+
+def _decided(look: "Look", verdicts: "Verdicts | None") -> str:
+    if verdicts is None or verdicts.detector is None:
+        return ""
+    detector = verdicts.detector
+    terms = signal_terms(detector, look.sealed)
+    told = [f"{name} {term:+.2f} (it is {look.sealed[name]:.3g})" for name, term in terms.items()]
+    return (
+        f"{', '.join(told)}: log odds of being off the map against a mean calibration frame, "
+        f"beside {detector.bias:+.2f} that every frame gets"
+    )
+
+
+def _tao(look: "Look") -> str:
+    s = look.signals
+    if look.unit == "m^2":
+        return (
+            f"{s['tao']:.4g} m^2 (rank association) = residuals {s['tao_geom']:.4g} + velocity "
+            f"{s['tao_vel']:.4g} + similarity {s['tao_sim']:.4g}"
+        )
+    missing = max(0.0, s["tao_window"] - s["tao_geom"] - s["tao_sim"])
+    return (
+        f"{s['tao']:.3f} = alignment {s['tao_align']:.3f} + recursive filter "
+        f"{s['tao'] - s['tao_align']:.3f} (it doubts its place with {s['recursive']:.3f}); over "
+        f"the whole window {s['tao_window']:.3f} = residuals {s['tao_geom']:.3f} + similarity "
+        f"{s['tao_sim']:.3f} + frames without support and turn {missing:.3f}"
+    )
+
+
+def _pose(pose: np.ndarray) -> str:
+    return f"x = {pose[0]:.2f} m, y = {pose[1]:.2f} m, {np.degrees(pose[2]):.0f} degrees"
+
+
+def _place(look: "Look") -> str:
+    if look.map_index < 0:
+        return "none: no pose is reported"
+    gap = np.hypot(*(look.pose[:2] - look.branches.pose[0, :2]))
+    return f"map row {look.map_index}, robot at {_pose(look.pose)}; {gap:.1f} m from branch 1, " + (
+        "for a jump was noticed" if look.status == "lost" else "which it makes more exact"
+    )
+
+
+def _branch(look: "Look") -> str:
+    b = look.branches
+    if not len(b.cost):
+        return "none: no hypothesis at all"
+    told = [f"1: cost {b.cost[0]:.3g}, started from {b.source[0]}, at {_pose(b.pose[0])}"]
+    for number in range(1, len(b.cost)):
+        away = np.hypot(*(b.pose[number, :2] - b.pose[0, :2]))
+        told.append(f"{number + 1}: cost {b.cost[number]:.3g}, {away:.0f} m away")
+    return "; ".join(told)
+
+
+def ranges(numbers: list[int]) -> str:
+    """Return sorted whole numbers as short text: `0 to 3, 7`."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs)
+
+
+def _window(look: "Look") -> str:
+    w = look.window
+    against = sorted(int(frame) for frame in w.frame[~w.is_inlier])
+    share = float(w.weight[~w.is_inlier].sum())
+    if not against:
+        return f"all of its {len(w.frame)} frames agree with branch 1"
+    return (
+        f"{len(against)} of its {len(w.frame)} frames disagree{'s' * (len(against) == 1)} with "
+        f"branch 1, with {share:.0%} of the weight: {ranges(against)}"
+    )
+
+
+def _costs(look: "Look") -> str:
+    costs = " ".join(f"{cost:.2f}" for cost in look.window.cost[:N_COSTS])
+    unit = "" if look.unit == "1" else f" {look.unit}"
+    tail = ", at most that" if look.unit == "1" else ""
+    return (
+        f"of the newest frames on branch 1, newest first: {costs}{unit}; a frame without support "
+        f"costs {look.no_support:.3g}{unit}{tail}"
+    )
+
+
+def _support(look: "Look") -> str:
+    stale = int(look.signals["stale"])
+    if stale == 0:
+        return "this frame itself supports the reported place"
+    if stale >= len(look.window.frame):
+        return "no frame of the window supports the reported place"
+    last = f"frame {look.frame - stale}, {stale} before, is the last that does"
+    return f"this frame does not support the reported place; {last}"
+
+
+def _rival(look: "Look") -> str:
+    s = look.signals
+    if look.unit == "m^2":
+        b = look.branches
+        if len(b.cost) < 2:
+            return "no branch lies at another place"
+        more = b.cost[1] - b.cost[0]
+        return f"the cheapest branch elsewhere costs {b.cost[1]:.4g} m^2, {more:.4g} more"
+    if s["tao_rival"] >= look.no_support:
+        return "no place elsewhere is supported at all"
+    return (
+        f"the cheapest place elsewhere costs {s['tao_rival']:.3f}, "
+        f"{s['tao_rival'] - s['tao_window']:.3f} more than branch 1: "
+        + ("ambiguous" if s["tao_rival"] - s["tao_window"] < 0.1 else "clearly worse")
+    )
+
+
+def _list(look: "Look") -> str:
+    n = len(look.candidate)
+    if not n:
+        return "no candidates"
+    most = np.log(n)
+    return (
+        f"{n} candidates, best similarity {look.similarity[0]:.3f}, entropy "
+        f"{look.signals['entropy']:.2f} of at most {most:.2f} nat; this map tells "
+        f"{look.map_recall:.0%} of its own places apart"
+    )
+
+
+def _margin(look: "Look", run: "Run", verdicts: "Verdicts | None") -> str:
+    if verdicts is None or verdicts.detector is None:
+        return ""
+    detector, p = verdicts.detector, verdicts.probability[look.frame]
+    if verdicts.verdict[look.frame] == "accept":
+        return f"log odds higher by {-_excess(look, detector):.2f} would have been rejected"
+    needs = [] if look.status == "ok" else [f"status ok instead of {look.status}"]
+    if look.sealed["stale"] > 0:
+        needs.append("support by the frame itself")
+    if p > detector.threshold:
+        needs.append(_lower(look, run, detector))
+    last = np.flatnonzero(verdicts.verdict[: look.frame] == "accept")
+    before = f"the last accepted frame is {last[-1]}" if last.size else "none before it was"
+    return f"to be accepted it lacks {' and '.join(needs) or 'a threshold'}; {before}"
+
+
+def _excess(look: "Look", detector: "Detector") -> float:
+    """Return how far the log odds lie above the threshold's."""
+    limit = detector.threshold
+    terms = signal_terms(detector, look.sealed)
+    return float(sum(terms.values()) + detector.bias - np.log(limit / (1.0 - limit)))
+
+
+def _lower(look: "Look", run: "Run", detector: "Detector") -> str:
+    """Say how far the log odds must fall, and which signal alone could do it."""
+    terms, excess = signal_terms(detector, look.sealed), _excess(look, detector)
+    ways = []
+    for name in terms:
+        at = detector.columns.index(name)
+        weight = detector.weight[at]
+        if abs(weight) < 1e-6:
+            continue
+        need = look.sealed[name] - excess * detector.scale[at] / weight
+        seen = np.asarray(run.signals[name], float)
+        share = float(np.mean(seen <= need if weight > 0 else seen >= need))
+        if share > 0:
+            bound = "at most" if weight > 0 else "at least"
+            ways.append(f"{name} {bound} {need:.3g} (as {share:.0%} of this run's frames)")
+    alone = f"alone, all else equal: {' or '.join(ways[:3])}" if ways else "no signal alone could"
+    return f"log odds lower by {excess:.2f} ({alone})"

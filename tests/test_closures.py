@@ -1,0 +1,246 @@
+"""Closures as files: a strict g2o reader, a strict TUM reader, and evo where it is installed."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from conftest import write_folder
+from judged import seal
+
+from taojax import closures, records
+from taojax.cli import main
+from taojax.detector import Detector, to_toml
+from taojax.errors import InputError
+from taojax.tables import read_table
+
+FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory):
+    """A run with verdicts of both kinds, its data folder and the calibration behind them."""
+    folder = tmp_path_factory.mktemp("closures")
+    data = write_folder(folder / "data", np.random.default_rng(3))
+    assert main(["score", str(data), "--out", str(folder / "first"), *FLAGS]) == 0
+    level = np.quantile(records.read_run(folder / "first").signals["tao"], 0.7)
+    one = np.ones(1)
+    made_up = Detector(("tao",), level * one, one, 9.0 * one, 0.0, 0.5, "made up")
+    (folder / "calibration.toml").write_text(to_toml(made_up))
+    words = ["--out", str(folder / "run"), "--calibration", str(folder / "calibration.toml")]
+    assert main(["score", str(data), *words, *FLAGS]) == 0
+    assert main(["closures", str(folder / "run")]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(scored):
+    return scored / "run"
+
+
+@pytest.fixture(scope="module")
+def verdict(run):
+    return read_table(run / "decisions.csv", "decisions")["verdict"]
+
+
+def judged(scored, folder, seal=None):
+    """Copy the run without verdicts and give it those of a judge."""
+    shutil.copytree(scored / "first", folder)
+    sealed = records.read_manifest(folder)["seal"]
+    (folder / "audit.json").write_text(json.dumps({"run_seal": seal or sealed}))
+    rows = [f"{t},accept,0.1,made up" for t in range(50)]
+    head = "frame,verdict,probability_map_out,reason"
+    (folder / "verdicts.csv").write_text("\n".join([head, *rows]) + "\n")
+    return folder
+
+
+def read_g2o(path):
+    """Read vertices and edges; anything that is not the format fails."""
+    vertices, edges = {}, []
+    for line in path.read_text().splitlines():
+        tag, *cells = line.split(" ")
+        if tag == "VERTEX_SE2":
+            number, *pose = cells
+            assert int(number) not in vertices
+            assert len(pose) == 3
+            vertices[int(number)] = np.array(pose, float)
+            continue
+        assert tag == "EDGE_SE2"
+        assert len(cells) == 2 + 3 + 6
+        values = np.array(cells[2:], float)
+        upper = np.zeros((3, 3))
+        upper[np.triu_indices(3)] = values[3:]
+        information = upper + upper.T - np.diag(np.diag(upper))
+        assert (np.linalg.eigvalsh(information) > 0).all()
+        edges.append((int(cells[0]), int(cells[1]), values[:3], information))
+    for a, b, *_ in edges:
+        assert a in vertices
+        assert b in vertices
+        assert a != b
+    assert all(np.isfinite(pose).all() for pose in vertices.values())
+    return vertices, edges
+
+
+def matrix(pose):
+    x, y, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, x], [s, c, y], [0, 0, 1]])
+
+
+def test_the_graph_holds_map_query_frames_odometry_and_the_accepted_closures(run, verdict):
+    vertices, edges = read_g2o(run / "closures.g2o")
+    n_map, n_query = 60, 50
+    assert sorted(vertices) == list(range(n_map + n_query))
+    in_map = [e for e in edges if e[1] < n_map]
+    driven = [e for e in edges if e[0] >= n_map]
+    closed = [e for e in edges if e[0] < n_map <= e[1]]
+    assert [e[:2] for e in in_map] == [(i, i + 1) for i in range(n_map - 1)]
+    assert [e[:2] for e in driven] == [(n_map + t - 1, n_map + t) for t in range(1, n_query)]
+    assert [e[1] - n_map for e in closed] == np.flatnonzero(verdict == "accept").tolist()
+    assert len(closed) > 10
+
+
+def test_a_closure_leads_from_its_map_pose_to_the_answered_pose(run):
+    vertices, edges = read_g2o(run / "closures.g2o")
+    sealed = records.read_run(run)
+    for a, b, motion, information in edges:
+        if not a < 60 <= b:
+            continue
+        t = b - 60
+        assert a == sealed.signals["map_index"][t]
+        want = [sealed.signals[c][t] for c in ("x_m", "y_m", "theta_rad")]
+        np.testing.assert_allclose(matrix(vertices[a]) @ matrix(motion), matrix(want), atol=1e-6)
+        np.testing.assert_allclose(vertices[b], want, atol=1e-6)
+        delta = 3.0 * sealed.manifest["map_spacing_m"]
+        want = np.diag([1 / delta**2, 1 / delta**2, (6 / 3.0) ** 2])
+        np.testing.assert_allclose(information, want, rtol=1e-6)
+
+
+def test_the_maps_own_edges_keep_it_as_it_is(run):
+    vertices, edges = read_g2o(run / "closures.g2o")
+    for a, b, motion, _ in edges[:59]:
+        np.testing.assert_allclose(
+            matrix(vertices[a]) @ matrix(motion), matrix(vertices[b]), atol=1e-5
+        )
+
+
+def test_rejected_closures_lie_in_a_file_of_their_own(run, verdict):
+    _, edges = read_g2o(run / "rejected.g2o")
+    closed = {b - 60 for a, b, *_ in edges if a < 60 <= b}
+    assert closed <= set(np.flatnonzero(verdict == "reject").tolist())
+
+
+def test_the_trajectory_holds_the_accepted_poses_and_full_stamps(run, verdict):
+    table = read_table(run / "trajectory.tum", "tum")
+    sealed = records.read_run(run)
+    rows = np.flatnonzero(verdict == "accept")
+    np.testing.assert_array_equal(table["t_s"], sealed.signals["t_s"][rows])
+    np.testing.assert_allclose(table["x_m"], sealed.signals["x_m"][rows], atol=1e-6)
+    theta = 2 * np.arctan2(table["qz"], table["qw"])
+    want = sealed.signals["theta_rad"][rows].astype(float)
+    np.testing.assert_allclose(np.cos(theta - want), 1.0, atol=1e-9)
+
+
+def test_evo_reads_the_trajectory(run, tmp_path):
+    if not shutil.which("evo_traj"):
+        pytest.skip("evo is not installed: python -m pip install evo")
+    env = os.environ | {"HOME": str(tmp_path), "MPLBACKEND": "Agg"}
+    done = subprocess.run(
+        ["evo_traj", "tum", str(run / "trajectory.tum"), "--full_check"],
+        env=env, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    n = len((run / "trajectory.tum").read_text().splitlines())
+    assert re.search(rf"nr\. of poses\s+{n}\b", done.stdout)
+    assert "quaternions" in done.stdout
+    assert "invalid" not in done.stdout.lower()
+
+
+def graph(n=6, **changes):
+    made = {
+        "map_pose": np.zeros((3, 3)),
+        "query_pose": np.zeros((n, 3)),
+        "t_s": np.arange(n) + 1628226000.123456,
+        "odometry": np.tile([1.0, 0.0, 0.0], (n, 1)),
+        "is_start": np.arange(n) == 0,
+        "pose": np.tile([5.0, 6.0, 0.5], (n, 1)),
+        "map_index": np.ones(n, int),
+        "verdict": np.array(["accept"] * n, dtype=object),
+        "sigma_m": 3.0,
+        "sigma_rad": 0.1,
+        "spacing_m": 1.0,
+    }
+    return closures.Graph(**(made | changes))
+
+
+def test_unix_stamps_keep_their_digits_and_equal_ones_are_told_once():
+    t_s = 1628226000.123456 + np.array([0.0, 0.1, 0.1, 0.2, 0.2, 0.3])
+    lines = closures.tum_text(graph(t_s=t_s)).splitlines()
+    assert [float(line.split()[0]) for line in lines] == np.unique(t_s).tolist()
+
+
+def test_between_accepted_frames_odometry_carries_on_and_each_trial_starts_alone():
+    odometry = np.tile([1.0, 0.0, 0.0], (8, 1))
+    known = np.full((8, 3), np.nan)
+    known[2] = [10.0, 5.0, np.pi / 2]
+    is_start = np.arange(8) % 4 == 0
+    poses = closures._chained(odometry, known, is_start)
+    np.testing.assert_allclose(poses[:4, :2], [[10, 3], [10, 4], [10, 5], [10, 6]], atol=1e-12)
+    np.testing.assert_allclose(poses[4:, :2], [[0, 0], [1, 0], [2, 0], [3, 0]], atol=1e-12)
+    lines = closures.g2o_text(graph(n=8, odometry=odometry, is_start=is_start), "accept")
+    driven = [line.split()[1:3] for line in lines.splitlines() if line.startswith("EDGE")][2:8]
+    assert ["6", "7"] not in driven
+    assert len(driven) == 6
+
+
+def test_a_frame_without_pose_closes_nothing():
+    made = graph(map_index=np.array([1, -1, 1, -1, 1, 1]))
+    assert made.rows("accept").tolist() == [0, 2, 4, 5]
+    assert len(closures.tum_text(made).splitlines()) == 4
+
+
+def fails(capsys, *words):
+    assert main(list(words)) == 3
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line
+    return line
+
+
+def test_a_run_without_verdicts_says_what_to_do(scored, capsys):
+    assert "taojax evaluate" in fails(capsys, "closures", str(scored / "first"))
+
+
+def test_without_verdicts_of_its_own_a_run_has_the_judges(scored, tmp_path, capsys):
+    folder, out = judged(scored, tmp_path / "run"), tmp_path / "elsewhere"
+    assert main(["closures", str(folder), "--out", str(out)]) == 0
+    assert "verdicts.csv" in capsys.readouterr().out
+    names = {path.name for path in out.iterdir()}
+    assert names == {"closures.g2o", "rejected.g2o", "trajectory.tum"}
+
+
+def test_the_detector_is_sealed_with_its_decisions(run, tmp_path, capsys):
+    sealed = closures.read_verdicts(run, records.read_run(run))
+    assert sealed.source == "decisions.csv"
+    assert sealed.detector.columns == ("tao",)
+    broken = tmp_path / "run"
+    shutil.copytree(run, broken)
+    raw = (broken / "detector.toml").read_text()
+    (broken / "detector.toml").write_text(raw.replace("bias = ", "bias = 1"))
+    assert "detector.toml: seal broken" in fails(capsys, "closures", str(broken))
+
+
+def test_verdicts_of_another_run_are_refused(scored, tmp_path):
+    folder = judged(scored, tmp_path / "run", seal="0" * 64)
+    with pytest.raises(InputError, match="another run"):
+        closures.read_verdicts(folder, records.read_run(folder))
+
+
+def test_a_run_sealed_without_odometry_is_told_to_score_again(tmp_path):
+    folder, _ = seal(tmp_path)
+    sealed = records.read_run(folder)
+    verdicts = closures.Verdicts("x", np.array(["accept"] * 240), np.zeros(240), None, None)
+    with pytest.raises(InputError, match="score the data set again"):
+        closures.build_graph(folder, sealed, verdicts)

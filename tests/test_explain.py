@@ -1,0 +1,212 @@
+"""Explaining a frame: replayed from the sealed files alone, equal to what was sealed."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from conftest import write_folder
+from judged import seal
+
+from taojax import records
+from taojax.cli import main
+from taojax.config import Config, StreamConfig
+from taojax.detector import Detector
+from taojax.errors import InputError
+from taojax.runtime.explain import TOLERANCE, explain
+from taojax.runtime.score import score
+from taojax.verbs.explain_page import ranges
+
+SHAPE = {"window": 6, "branches": 5, "joint_window": 8, "joint_seeds": 3}
+CALIBRATION = Detector(
+    ("tao", "top1_w5"), np.array([0.3, 0.3]), np.ones(2), np.array([6.0, 1.0]), 0.0, 0.5, "made up"
+)
+
+
+def lost_folder(folder):
+    """A data folder whose last ten frames look like nowhere."""
+    rng = np.random.default_rng(5)
+    write_folder(folder, rng)
+    path = folder / "query/descriptors.npy"
+    seen = np.load(path)
+    seen[40:] = rng.normal(size=seen[40:].shape)
+    np.save(path, seen)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("explain")
+    data = lost_folder(folder / "data")
+    for name in ("joint", "rank"):
+        config = Config(stream=StreamConfig(**SHAPE, association=name))
+        score(data, folder / name, config, detector=CALIBRATION)
+    # What explains a run must lie in the run.
+    shutil.rmtree(data)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["joint", "rank"])
+@pytest.mark.parametrize("frame", [0, 2, 30, 49])
+def test_the_replay_gives_the_sealed_row(name, frame, folder):
+    run = records.read_run(folder / name)
+    look = explain(folder / name, run, frame)
+    assert look.gap <= 1.0
+    for signal, value in look.signals.items():
+        # a_aniso divides by a number near zero on straight windows.
+        limit = 1e-2 if signal in ("a_aniso", "c_geom", "h_proxy") else TOLERANCE
+        assert value == pytest.approx(look.sealed[signal], rel=limit, abs=limit), signal
+    assert look.status == run.signals["status"][frame]
+    assert look.map_index == run.signals["map_index"][frame]
+    assert len(look.window.frame) == min(frame + 1, 8 if name == "joint" else 6)
+    assert look.window.frame[0] == frame
+    assert look.window.weight.sum() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_joint_window_and_branches_add_up_to_the_sealed_costs(folder):
+    run = records.read_run(folder / "joint")
+    look = explain(folder / "joint", run, 30)
+    window = look.window
+    assert look.branches.cost[0] == pytest.approx(look.sealed["tao_window"], abs=1e-5)
+    assert (window.cost * window.weight).sum() <= look.sealed["tao_window"] + 1e-5
+    share = 1.0 - window.is_inlier.mean()
+    assert share == pytest.approx(look.sealed["support"], abs=1e-6)
+    assert (window.cost <= look.no_support + 1e-6).all()
+    assert window.cost[~window.is_inlier] == pytest.approx(look.no_support, abs=1e-6)
+    assert (np.diff(look.branches.cost) >= 0).all()
+
+
+def test_the_rank_window_adds_up_to_the_sealed_cost(folder):
+    run = records.read_run(folder / "rank")
+    look = explain(folder / "rank", run, 30)
+    total = (look.window.cost * look.window.weight).sum() + look.sealed["tao_vel"]
+    # The cheapest of all branches and the cheapest with a candidate are one here.
+    assert total == pytest.approx(look.sealed["tao"], rel=1e-4)
+    there = look.window.anchor >= 0
+    assert (look.window.anchor[there] < 60).all()
+    assert look.window.anchor[0] in look.candidate
+
+
+def test_no_later_frame_is_looked_at(folder, monkeypatch):
+    run = records.read_run(folder / "joint")
+    before = explain(folder / "joint", run, 20)
+    run.index[21:] = -1
+    run.similarity[21:] = np.nan
+    after = explain(folder / "joint", run, 20)
+    assert before.signals == after.signals
+
+
+def test_a_trial_is_explained_from_its_own_start(tmp_path):
+    data = lost_folder(tmp_path / "data")
+    (data / "about.toml").write_text('notes = ["made up"]\ntrial_frames = 25\n')
+    config = Config(stream=StreamConfig(**SHAPE, association="rank"))
+    score(data, tmp_path / "run", config)
+    run = records.read_run(tmp_path / "run")
+    look = explain(tmp_path / "run", run, 27)
+    assert look.gap <= 1.0
+    assert look.window.frame.tolist() == [27, 26, 25]
+
+
+def told(capsys, *words):
+    assert main(["explain", *map(str, words), "--no-progress"]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["joint", "rank"])
+def test_it_says_verdict_signals_branch_frames_and_margin_and_draws(name, folder, tmp_path, capsys):
+    text = told(capsys, folder / name, "--frame", 47, "--out", tmp_path / "out")
+    for label in ("verdict", "decided by", "tao", "window", "costs", "rival", "list", "margin"):
+        assert f"\n{label} " in text, label
+    assert "decisions.csv" in text
+    assert max(map(len, text.splitlines())) <= 92
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files == {"frame_47.png", "frame_47.svg", "frame_47.csv"}
+    with (tmp_path / "out/frame_47.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    kinds = [row["kind"] for row in rows]
+    assert kinds.count("frame") == (8 if name == "joint" else 6)
+    assert kinds.count("branch") >= 1
+    assert kinds.count("candidate") == 60
+    assert rows[0]["number"] == "47"
+
+
+def test_a_rejected_frame_and_an_accepted_one_say_so(folder, capsys, tmp_path):
+    verdicts = (folder / "joint/decisions.csv").read_text().splitlines()[1:]
+    said = {row.split(",")[1]: int(row.split(",")[0]) for row in verdicts}
+    for verdict, words in (("reject", "to be accepted it lacks"), ("accept", "would have been")):
+        text = told(capsys, folder / "joint", "--frame", said[verdict], "--out", tmp_path)
+        assert f"verdict     {verdict}" in text
+        assert words in " ".join(text.split())
+
+
+def test_pictures_lie_in_the_run_folder_where_nothing_else_is_said(folder, tmp_path, capsys):
+    shutil.copytree(folder / "joint", tmp_path / "run")
+    told(capsys, tmp_path / "run", "--frame", 0)
+    assert (tmp_path / "run/explain/frame_0.png").stat().st_size > 0
+    # The seal covers what was sealed, not what was added.
+    records.read_run(tmp_path / "run")
+
+
+def fails(capsys, code, *words):
+    try:
+        got = main(["explain", *map(str, words)])
+    except SystemExit as stop:
+        got = stop.code
+    captured = capsys.readouterr()
+    line = captured.err.strip()
+    assert got == code
+    assert captured.out == ""
+    assert "\n" not in line
+    return line
+
+
+@pytest.mark.parametrize("frame", [-1, 50, 10**9])
+def test_a_frame_out_of_range_is_exit_3_and_names_the_range(frame, folder, capsys):
+    assert "0 to 49" in fails(capsys, 3, folder / "joint", "--frame", frame)
+
+
+def test_a_broken_seal_is_exit_3(folder, tmp_path, capsys):
+    shutil.copytree(folder / "joint", tmp_path / "run")
+    path = tmp_path / "run/odometry.csv"
+    raw = bytearray(path.read_bytes())
+    raw[-5] ^= 1
+    path.write_bytes(raw)
+    line = fails(capsys, 3, tmp_path / "run", "--frame", 3)
+    assert "odometry.csv: seal broken" in line
+
+
+def test_a_run_of_an_older_version_says_what_is_missing(tmp_path, capsys):
+    run, _ = seal(tmp_path)
+    line = fails(capsys, 3, run, "--frame", 3)
+    assert "map_scale, map_recall, trial_frames, odometry.csv" in line
+    assert "taojax score" in line
+
+
+def test_a_replay_that_differs_is_exit_1_and_explains_nothing(folder, capsys, monkeypatch):
+    monkeypatch.setattr("taojax.runtime.explain.TOLERANCE", 1e-300)
+    run = records.read_run(folder / "joint")
+    # A row that no replay gives; the seal was checked before.
+    run.signals["tao"] += 1.0
+    monkeypatch.setattr("taojax.records.read_run", lambda path: run)
+    line = fails(capsys, 1, folder / "joint", "--frame", 10)
+    assert "nothing can be explained" in line
+
+
+def test_the_manifest_holds_what_the_map_said(folder):
+    facts = json.loads((folder / "joint/manifest.json").read_text())
+    assert facts["map_spacing_m"] > 0
+    assert facts["map_scale"][0] < facts["map_scale"][1]
+    assert 0 <= facts["map_recall"] <= 1
+    assert facts["trial_frames"] is None
+    assert facts["sha256"]["odometry.csv"] == facts["sha256"]["inputs/query/odometry.csv"]
+
+
+def test_nothing_but_sealed_files_is_read(folder):
+    with pytest.raises(InputError, match="0 to 49"):
+        explain(folder / "joint", records.read_run(folder / "joint"), 50)
+
+
+def test_ranges_are_short():
+    assert ranges([0, 1, 2, 5, 7, 8]) == "0 to 2, 5, 7 to 8"
+    assert ranges([]) == ""

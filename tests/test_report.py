@@ -1,0 +1,209 @@
+"""The page of a run: small, self-contained, and every number defined."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import judged
+import numpy as np
+import pytest
+
+from taojax import records
+from taojax.audit import figures, route
+from taojax.audit.evaluate import evaluate
+from taojax.audit.glossary import glossary, marked
+from taojax.audit.page import Page, render
+from taojax.audit.words import find_words, lead_words
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    run, truth = judged.seal(tmp_path_factory.mktemp("case"))
+    with pytest.MonkeyPatch.context() as patch:
+        # Pictures take most of the time; one is enough for the page.
+        patch.setattr(figures, "draw", lambda judgement: (figures.retrieval(judgement),))
+        return run, evaluate(run, truth, judged.config())
+
+
+@pytest.fixture(scope="module")
+def held(case):
+    run, done = case
+    sealed = records.read_run(run)
+    return (
+        sealed,
+        done,
+        json.loads(route.route_json(done.judgement, sealed.index, sealed.similarity)),
+    )
+
+
+def unpacked(text, kind):
+    return np.frombuffer(base64.b64decode(text), dtype=kind)
+
+
+class _Seen(HTMLParser):
+    """Collect what defines the numbers of a page."""
+
+    def __init__(self):
+        super().__init__()
+        self.cards, self.heads, self.open = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        facts = dict(attrs)
+        if facts.get("class") == "card":
+            self.cards.append(facts.get("title", ""))
+        if tag == "abbr" and self.open and self.open[-1] == "th":
+            self.heads.append(facts.get("title", ""))
+        if tag in ("th", "abbr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.open and self.open[-1] == tag:
+            self.open.pop()
+
+
+def test_every_number_has_a_definition_and_the_command_that_made_it(case):
+    run, done = case
+    page = _Seen()
+    page.feed((run / "report.html").read_text())
+    tables = [title for title in page.heads if "made by" in title]
+    assert len(page.cards) == 6
+    assert len(tables) > 40
+    for title in (*page.cards, *tables):
+        meaning, _, command = title.partition(" — made by: ")
+        assert len(meaning) > 3 or "frame" in meaning, title
+        assert command == done.command
+
+
+def test_the_first_screen_says_what_was_found_before_any_table(case):
+    run, done = case
+    html = (run / "report.html").read_text()
+    first = html[: html.index('id="tables"')]
+    plain = re.sub(r"&[#\w]+;|<[^>]*>", "", first)
+    for sentence in lead_words(done.judgement):
+        assert re.sub(r"[<>&'\"]", "", sentence) in plain
+    assert find_words(done.judgement)[: len(lead_words(done.judgement))] == lead_words(
+        done.judgement
+    )
+    assert len(set(done.sentences)) == len(done.sentences)
+
+
+def test_without_javascript_everything_but_the_route_is_there(case):
+    run, done = case
+    html = (run / "report.html").read_text()
+    still = re.sub(r"<script.*?</script>", "", html, flags=re.DOTALL)
+    assert re.search(r'<section id="route"[^>]* hidden>', still)
+    assert "<noscript>" in still
+    assert still.count("<table>") > 8
+    plain = re.sub(r"&[#\w]+;|<[^>]*>", "", still)
+    for sentence in done.sentences:
+        assert re.sub(r"[<>&'\"]", "", sentence) in plain
+
+
+def test_the_page_reaches_for_nothing_outside_itself(case):
+    html = (case[0] / "report.html").read_text()
+    assert not re.search(r"(src|href)=\"(?!data:|#)", html)
+    assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest|import\(", html)
+    assert set(re.findall(r"https?://[^\"' <]+", html)) <= {"http://www.w3.org/2000/svg"}
+
+
+def test_a_thousand_frames_stay_below_a_megabyte_and_a_half(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "draw", lambda judgement: ())
+    run, truth = judged.seal(tmp_path, n=1000)
+    evaluate(run, truth, judged.config(n_bootstrap=10))
+    assert (run / "report.html").stat().st_size < 1_500_000
+
+
+def test_the_route_holds_the_sealed_candidates_and_the_judged_frames(held):
+    sealed, done, found = held
+    judgement, n = done.judgement, 240
+    rows = unpacked(found["candidates"]["row"], "<u2").reshape(n, -1).astype(int) - 1
+    np.testing.assert_array_equal(rows, sealed.index[:, : rows.shape[1]])
+    low, high = found["candidates"]["low"], found["candidates"]["high"]
+    alike = (
+        unpacked(found["candidates"]["alike"], "<u2").reshape(n, -1) / 65535 * (high - low) + low
+    )
+    known = rows >= 0
+    np.testing.assert_allclose(alike[known], sealed.similarity[known], atol=1e-4)
+    truth = unpacked(found["truth"], "<f4").reshape(n, 2) + np.array(found["origin"])
+    np.testing.assert_allclose(truth, judgement.query_m, atol=1e-3)
+    values = unpacked(found["values"], "<f4").reshape(-1, n)
+    names = [signal["name"] for signal in found["signals"]]
+    np.testing.assert_allclose(values[names.index("tao")], sealed.signals["tao"], rtol=1e-6)
+    reasons = [found["reasons"][at] for at in found["reason"]]
+    assert reasons == judgement.verdicts["reason"].tolist()
+    letter = {"accept": "a", "reject": "r", "abstain": "-"}
+    assert found["verdict"] == "".join(letter[v] for v in judgement.verdicts["verdict"])
+
+
+def test_terms_on_the_page_add_up_to_the_probability(held):
+    _, done, found = held
+    model, n = found["model"], 240
+    values = unpacked(found["values"], "<f4").reshape(-1, n).astype(float)
+    terms = [
+        (values[c] - m) / s * w
+        for c, m, s, w in zip(
+            *(model[k] for k in ("columns", "mean", "scale", "weight")), strict=True
+        )
+    ]
+    odds = np.sum(terms, axis=0) + done.judgement.detector.bias
+    np.testing.assert_allclose(1 / (1 + np.exp(-odds)), values[-1], atol=1e-5)
+
+
+def test_a_long_run_is_thinned_and_says_so(held, monkeypatch):
+    sealed, done, _ = held
+    monkeypatch.setattr(route, "MOST_FRAMES", 100)
+    found = json.loads(route.route_json(done.judgement, sealed.index, sealed.similarity))
+    assert (found["every"], found["frames"], len(found["verdict"])) == (3, 240, 80)
+    assert found["verdict"][1] == held[2]["verdict"][3]
+
+
+def test_fewer_candidates_are_embedded_where_there_is_no_room(held, monkeypatch):
+    sealed, done, _ = held
+    monkeypatch.setattr(route, "_CANDIDATE_BYTES", 16_000)
+    found = json.loads(route.route_json(done.judgement, sealed.index, sealed.similarity))
+    assert found["candidates"]["k"] == 12
+    assert found["candidates"]["of"] == 100
+
+
+def test_text_of_a_run_cannot_end_the_script_that_holds_it(held):
+    sealed, done, _ = held
+    verdicts = dict(done.judgement.verdicts)
+    verdicts["reason"] = np.full(240, "</script><b>", dtype=object)
+    judgement = done.judgement._replace(verdicts=verdicts)
+    text = route.route_json(judgement, sealed.index, sealed.similarity)
+    assert "<" not in text
+    assert json.loads(text)["reasons"] == ["</script><b>"]
+
+
+def test_a_run_that_is_never_judged_still_has_a_route(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "draw", lambda judgement: ())
+    run, truth = judged.seal(tmp_path, n=60, status="lost")
+    evaluate(run, truth, judged.config(r_in_m=1e-6, r_out_m=1e-5))
+    assert 'id="route-data"' in (run / "report.html").read_text()
+
+
+def test_marking_keeps_the_text_and_takes_the_longest_word_once():
+    words = {"FAR": "short", "FAR at 95 %": "long", "in-map": "inside"}
+    text = "FAR at 95 % and FAR, FAR again; AFAR in-mapped in-map."
+    pieces = marked(text, words)
+    assert "".join(piece.text for piece in pieces) == text
+    assert [(p.text, p.title) for p in pieces if p.title] == [
+        ("FAR at 95 %", "long"), ("FAR", "short"), ("in-map", "inside"),
+    ]  # fmt: skip
+    assert [p.text for p in marked(text, {})] == [text]
+
+
+def test_no_definition_is_empty():
+    assert all(len(meaning) > 10 for meaning in glossary().values())
+
+
+def test_a_page_without_route_words_or_pictures_renders():
+    page = Page(
+        title="A < B", subtitle="", notes=[], headline=["said"], cards=[], grids=[], pictures=[],
+        facts={}, command="taojax kidnap",
+    )  # fmt: skip
+    html = render(page)
+    assert "A &lt; B" in html
+    assert 'id="route-data"' not in html
+    assert 'href="#figures"' not in html
