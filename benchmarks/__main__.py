@@ -26,6 +26,8 @@ def _parser() -> argparse.ArgumentParser:
     progress = verbs.add_parser("progress", help="the paper's Table 3: no poses")
     progress.add_argument("--out", type=Path, help="folder to make (default runs/progress/TIME)")
     progress.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
+    gallery = verbs.add_parser("gallery", help="the README's sheet of figures")
+    gallery.add_argument("--out", type=Path, help="folder to make (default runs/gallery/TIME)")
     refinement = verbs.add_parser("refinement", help="what the true Huber minimum buys and costs")
     refinement.add_argument("--quick", action="store_true", help="500 windows instead of 10,000")
     refinement.add_argument(
@@ -63,6 +65,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import progress
 
         progress.run(out, args.data)
+    elif args.verb == "gallery":
+        from benchmarks import gallery
+
+        gallery.run(out)
     elif args.verb == "refinement":
         from benchmarks import refinement
 

@@ -121,15 +121,15 @@ def _verbs() -> list[Target]:
         Target(
             "inspect lists", lambda f: write_data(f, lists=True), (*DATA, *LISTS), _inspect, 0.25
         ),
-        Target("score", write_data, (*DATA, *VIEWS), _score, 0.15),
-        Target("score lists", lambda f: write_data(f, lists=True), (*DATA, *LISTS), _score, 0.15),
-        Target("evaluate", _sealed, (*RUN, *TRUTH), _evaluate, 0.15),
+        Target("score", write_data, (*DATA, *VIEWS), _score, 0.05),
+        Target("score lists", lambda f: write_data(f, lists=True), (*DATA, *LISTS), _score, 0.05),
+        Target("evaluate", _sealed, (*RUN, *TRUTH), _evaluate, 0.05),
         Target(
             "evaluate forged",
             _sealed,
             (*RUN, *TRUTH),
             functools.partial(_evaluate, reseals=True),
-            0.15,
+            0.05,
         ),
     ]
 

@@ -150,7 +150,7 @@ def test_a_truth_linked_into_query_is_not_read(home, data, tmp_path):
 def test_true_poses_linked_in_place_of_odometry_are_refused(data, tmp_path):
     (data / "query/odometry.csv").unlink()
     (data / "query/odometry.csv").symlink_to(data / "truth/query_poses.csv")
-    with pytest.raises(InputError, match=r"odometry\.csv: row 1: header is"):
+    with pytest.raises(InputError, match=r"odometry\.csv: is a link into .*truth"):
         score(data, tmp_path / "run", SMALL)
 
 
