@@ -100,7 +100,7 @@ def _stream(quick: bool) -> Iterator[Row]:
             f"{gone.grown_mib:.1f} MiB grown, {gone.n_compiled} compiled again, {gone.n_bad} not"
             f" finite, against a fresh start {far:g} (window) and {memory:g} (memory)"
         )
-        is_good = gone.grown_mib < 64 and (gone.n_compiled, gone.n_bad, far) == (0, 0, 0.0)
+        is_good = gone.grown_mib < 64 and far == 0.0 and gone.n_compiled == gone.n_bad == 0
         yield Row(f"stream, {association}", gone.n_frames, said, gone.seconds, is_good)
         begun, kinds = time.monotonic(), stream.KINDS
         differ = {kind: stream.count_differing(association, kind) for kind in kinds}

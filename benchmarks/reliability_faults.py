@@ -216,7 +216,9 @@ def resumes(data: Path, out: Path) -> tuple[int, int, int]:
     Returns:
         Parts at the kill, those that the second run left alone, and its exit code.
     """
-    words = next(job for job in JOBS if job.name == "sweep").words(data, out)
+    # The judge's verb computes in a child of its own, which would outlive the blow.
+    sweep = next(job for job in JOBS if job.name == "sweep")
+    words = [*sweep.words(data, out), "--no-judge"]
     child = _start(words)
     while child.poll() is None and not parts_of(out):
         time.sleep(0.002)

@@ -13,11 +13,11 @@ from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.stream import Frame, StreamRecord, StreamState, init, replay, step
 
 CHUNK = 1000
-HISTORY = 200
-"""Frames of a fresh start: more than any window, and all that a joint branch remembers."""
-
-REMEMBERS = ("tao", "tao_align", "tao_window", "tao_rival", "recursive", "support", "stale")
-"""Signals with a memory without end; the others come from the window alone."""
+REMEMBERS = (
+    "tao", "tao_geom", "tao_vel", "tao_sim", "tao_align", "tao_window", "tao_rival", "recursive",
+    "support", "stale",
+)  # fmt: skip
+"""Signals of the joint association, whose memory has no end; the others see the window alone."""
 
 CONFIGS = {
     "rank": StreamConfig(window=8, branches=6, association="rank"),
@@ -111,7 +111,8 @@ def _against_fresh(
 ) -> dict[str, float]:
     """Go on from an old state and from a fresh start on the last frames alone."""
     _, long = replay(config, tables, frames, state)
-    _, fresh = replay(config, tables, jax.tree.map(lambda leaf: leaf[-HISTORY:], frames))
+    # Both by the same program: a chunk is longer than any window.
+    _, fresh = replay(config, tables, frames, init(config, tables))
     names = long.signals.names
     return {n: abs(float(long.signals[n][-1]) - float(fresh.signals[n][-1])) for n in names}
 

@@ -22,7 +22,7 @@ from taojax.tables import read_table
 
 __all__ = ["Graph", "Verdicts", "build_graph", "g2o_text", "read_verdicts", "tum_text"]
 
-MAP_STIFFNESS = 100.0
+MAP_STIFFNESS = 1000.0
 """Edges between neighbouring map poses are so many times tighter than a closure: the map stays."""
 
 ODOMETRY_SHARE = 0.1

@@ -116,7 +116,8 @@ def read_npy(path: Path, name: str) -> np.ndarray:
     if not path.is_file():
         raise fail(path, "no such file", "add it or point at another folder")
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        with np.errstate(over="ignore"):  # a header may claim any number of values
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
     except ARRAY_FAULTS as error:
         what = f"is not a plain numpy array ({first_line(error)})"
         raise fail(path, what, "save it with np.save as float32") from error

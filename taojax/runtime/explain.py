@@ -133,13 +133,15 @@ def sealed_tables(folder: Path, run: Run, config: StreamConfig) -> MapTables:
     return eqx.tree_at(lambda t: (t.scale, t.recall), tables, (scale, recall))
 
 
-def _distinct(inside: Inside, apart_m: float, sources: list[str]) -> Branches:
+def _distinct(inside: Inside, apart_m: float, most: float, sources: list[str]) -> Branches:
     """Return the cheapest branches that are at places of their own."""
     cost, pose = (np.asarray(leaf, float) for leaf in (inside.branch_cost, inside.branch_pose))
     kept: list[int] = []
     for row in np.argsort(cost, kind="stable"):
         gaps = [np.hypot(*(pose[row, :2] - pose[other, :2])) for other in kept]
-        if np.isfinite(cost[row]) and all(gap > apart_m for gap in gaps):
+        # Beside the best one, a branch that nothing supports is none.
+        is_live = np.isfinite(cost[row]) and (cost[row] < most or not kept)
+        if is_live and all(gap > apart_m for gap in gaps):
             kept.append(int(row))
         if len(kept) == N_BRANCHES:
             break
@@ -241,7 +243,7 @@ def _look(
             of_window(inside.weight).astype(float),
             of_window(inside.is_inlier),
         ),
-        branches=_distinct(inside, apart_m, _sources(config)),
+        branches=_distinct(inside, apart_m, np.inf if is_rank else most - 1e-3, _sources(config)),
         candidate=run.index[frame][there].astype(int),
         similarity=run.similarity[frame][there].astype(float),
         no_support=most,

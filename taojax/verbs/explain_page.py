@@ -131,7 +131,7 @@ def _place(look: "Look") -> str:
         return "none: no pose is reported"
     gap = np.hypot(*(look.pose[:2] - look.branches.pose[0, :2]))
     return f"map row {look.map_index}, robot at {_pose(look.pose)}; {gap:.1f} m from branch 1, " + (
-        "for a jump was noticed" if look.status == "lost" else "which it makes more exact"
+        "because a jump was noticed" if look.status == "lost" else "known from newer frames"
     )
 
 
