@@ -21,9 +21,12 @@ from taojax.records import read_manifest, read_run, write_run
 from taojax.specs import column_names, load_spec
 
 SMALL = ("--association", "rank", "--window", "3", "--branches", "4", "--no-progress")
-GRID = (
-    "[rank]\nlambda_velocity = [0.1, 1.0]\ndelta_spacings = [2.0, 3.0, 4.0]\nwindow = [3, 4, 5]\n"
-)
+GRID = """
+[rank]
+lambda_velocity = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]
+delta_spacings = [2.0, 3.0, 4.0, 5.0, 6.0]
+window = [3, 4, 5]
+"""
 WRITER = """
 import sys
 from pathlib import Path

@@ -118,7 +118,7 @@ def write_folder(
 
 
 def _table(spec: str, names: Sequence[str], t_s: np.ndarray, columns: np.ndarray) -> str:
-    # Stamps count from the first: nine digits cannot hold UNIX time to the millisecond.
+    # Stamps count from the first frame of each side.
     return table_text(spec, dict(zip(names, (t_s - t_s[0], *columns.T), strict=True)))
 
 

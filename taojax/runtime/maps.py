@@ -96,7 +96,7 @@ def _corner(tree: KDTree, low: np.ndarray, cell_m: float) -> np.ndarray:
     Anchors of an evenly spaced, axis-aligned map may all lie on cell edges, as far from the centre
     of their cell as their neighbours: half a cell further they are its centre.
     """
-    xy, corners, found = np.float32(tree.data), (low, low - 0.5 * cell_m), []
+    xy, corners, found = np.asarray(tree.data, np.float32), (low, low - 0.5 * cell_m), []
     for corner in corners:
         cell = np.floor((xy - np.float32(corner)) / np.float32(cell_m))  # as `look_up` rounds
         centre = corner + (cell + 0.5) * cell_m
