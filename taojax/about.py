@@ -32,7 +32,7 @@ def read_about(folder: Path, n_query: int | None = None) -> About:
         return About()
     try:
         about = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise fail(path, f"is not TOML ({error})", "expected notes = [...]") from error
     notes, frames = about.get("notes", []), about.get("trial_frames")
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):

@@ -178,8 +178,10 @@ def from_toml(path: Path) -> Config:
         ConfigError: unreadable file, unknown table or key, wrong type, value out of range.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("is not a file")
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as TOML: {error}") from error
     parts: dict[str, Any] = {}
     for name, value in tree.items():

@@ -89,7 +89,7 @@ def from_toml(path: Path) -> Detector:
         vectors = [np.array(tree[name], float) for name in ("mean", "scale", "weight")]
         bias, threshold = float(tree["bias"]), float(tree["threshold"])
         note = str(tree["note"])
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise InputError(f"{path}: is not a calibration file ({error}); {fix}") from error
     unknown = sorted(set(columns) - set(column_names("signals")))
     if unknown:

@@ -83,6 +83,9 @@ def digest_file(path: Path) -> str:
     Raises:
         InputError: the file cannot be read.
     """
+    if path.exists() and not path.is_file():
+        # A pipe or a device may never end.
+        raise InputError(f"{path}: is not a file; store the file itself")
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -244,9 +247,12 @@ def read_run(run: Path) -> Run:
             what = f"seal broken: sha256 {got[:12]}... is not {str(want)[:12]}..."
             raise InputError(f"{run / name}: {what}; score the data set again")
     arrays = read_npz(run / "retrievals.npz", "retrievals")
+    map_poses = read_table(run / "map_poses.csv", "map_poses")
+    if arrays["index"].max() >= len(map_poses["t_s"]):
+        raise InputError(f"{run / 'retrievals.npz'}: names map rows that map_poses.csv has not")
     return Run(
         signals=read_table(run / "signals.csv", "signals"),
-        map_poses=read_table(run / "map_poses.csv", "map_poses"),
+        map_poses=map_poses,
         index=arrays["index"],
         similarity=arrays["similarity"],
         config_toml=(run / "config.toml").read_text(encoding="utf-8"),

@@ -45,7 +45,7 @@ def test_a_pair_of_sequences_becomes_a_data_folder_that_loads(pair, tmp_path, ca
 
     seen = load_observations(out)
     assert len(seen.map_poses["t_s"]) == 58
-    assert seen.t_s == pytest.approx(t_s[kept] - t_s[0], abs=1e-6)
+    assert seen.t_s == pytest.approx(foreign.START_S + t_s[kept], abs=1e-6)
     notes = " ".join(seen.notes)
     assert "simulated odometry" in notes
     assert "simulated descriptors" in notes

@@ -17,7 +17,7 @@ from taojax.errors import InputError
 from taojax.specs import read_bytes, read_npy, read_npz
 from taojax.tables import read_table
 
-READERS = [*tables(), *own_files()[:2], *recordings()]
+READERS = [*tables(), *own_files(), *recordings()]
 
 
 @pytest.mark.parametrize("target", READERS, ids=lambda target: target.name)

@@ -44,6 +44,10 @@ MOST_EFFECTIVE = 40.0
 ACCEPTED_SHARE = 0.95
 """Share of the calibration frames that belong in the map which a frozen threshold accepts."""
 
+ROUNDING = 1e-6
+"""A level is so much above the frame that sets it, relative: files hold nine digits, and that frame
+must be accepted again where it is computed anew."""
+
 _TINY = 1e-9  # below it a signal is constant and says nothing
 LEAST_PER_CLASS = 5
 """Frames of each class below which the model is called a fallback."""
@@ -135,7 +139,8 @@ def accepting_level(inside: Float[np.ndarray, " n"]) -> float:
     """
     if not inside.size or np.isnan(inside).any():
         return float("nan")
-    return float(np.sort(inside)[int(np.ceil(ACCEPTED_SHARE * len(inside))) - 1])
+    level = float(np.sort(inside)[int(np.ceil(ACCEPTED_SHARE * len(inside))) - 1])
+    return level + ROUNDING * abs(level)
 
 
 def sigma_threshold(

@@ -50,9 +50,13 @@ def _counts(judgement: Judgement) -> list[str]:
     if n == 0:
         return ["The recording is too short to hold a test split: nothing is scored out of sample."]
     count = {v: int((verdict[test.frame] == v).sum()) for v in ("accept", "reject", "abstain")}
+    outcome = judgement.outcome[test.frame]
+    right, wrong = (int((outcome == f"accepted_{kind}").sum()) for kind in ("in", "wrong"))
+    share = f" ({100 * wrong / (right + wrong):.0f} % of them wrong)" if right + wrong else ""
     return [
         f"Of the {n} test frames ({test.frame[0]} to {test.frame[-1]}) taojax accepted "
-        f"{count['accept']}, rejected {count['reject']} and abstained on {count['abstain']}."
+        f"{count['accept']}, {right} at the right place and {wrong} at a wrong place{share}, "
+        f"rejected {count['reject']} and abstained on {count['abstain']}."
     ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.datasets.descriptors import read_views, view_notes
-from taojax.datasets.folder import Descriptors, Lists, Session, write_folder
+from taojax.datasets.folder import FAR_M, Descriptors, Lists, Session, write_folder
 from taojax.datasets.odometry import OdometryKind, odometry_at, read_odometry, simulated
 from taojax.datasets.simulate import WorldConfig, describe_routes
 from taojax.datasets.trajectories import Plane
@@ -29,9 +29,6 @@ N_MAP, N_QUERY = 2000, 1000
 
 LEAST_FRAMES = 3
 """A data folder has at least so many frames on each side."""
-
-FAR_M = 1e5
-"""Where coordinates of the map frame end; beyond, float32 loses centimetres."""
 
 WHEELS = "sensor_data/encoder.csv", "sensor_data/fog.csv", "calibration/EncoderParameter.txt"
 

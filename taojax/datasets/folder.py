@@ -19,6 +19,9 @@ __all__ = ["Descriptors", "Lists", "Session", "write_folder"]
 BLOCK_ROWS = 4096
 """Descriptors are copied so many at a time: a map may be larger than the memory."""
 
+FAR_M = 1e5
+"""Coordinates farther from the origin lose centimetres in float32."""
+
 POSE = ("t_s", "x_m", "y_m", "theta_rad")
 ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
 
@@ -78,7 +81,8 @@ def write_folder(
 
     Args:
         out: the folder to make.
-        mapped: poses of the map frames, any origin; the first becomes the origin.
+        mapped: poses of the map frames, any origin; beyond `FAR_M` of it the first frame becomes
+            the origin, and a note says so.
         query: stamps [s] and odometry (forward [m], left [m], yaw [rad]) of the query frames.
         views: descriptors or retrieval lists.
         truth: poses of the query frames in the frame of the map; None where nobody knows them.
@@ -93,11 +97,11 @@ def write_folder(
     try:
         for name in ("map", "query", *(("truth",) if truth is not None else ())):
             (part / name).mkdir(parents=True)
-        origin = np.array([[*mapped.xyt[0, :2], 0.0]])
+        origin, moved = _origin(mapped.xyt, truth)
         files = {
             "map/poses.csv": _table("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
             "query/odometry.csv": _table("query_odometry", ODOMETRY, *query),
-            "about.toml": f"notes = {json.dumps(list(notes), ensure_ascii=False)}\n",
+            "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n",
         }
         if truth is not None:
             files["truth/query_poses.csv"] = _table("query_poses", POSE, query[0], truth - origin)
@@ -118,8 +122,19 @@ def write_folder(
 
 
 def _table(spec: str, names: Sequence[str], t_s: np.ndarray, columns: np.ndarray) -> str:
-    # Stamps count from the first frame of each side.
-    return table_text(spec, dict(zip(names, (t_s - t_s[0], *columns.T), strict=True)))
+    return table_text(spec, dict(zip(names, (t_s, *columns.T), strict=True)))
+
+
+def _origin(
+    mapped: Float[np.ndarray, "m 3"], truth: Float[np.ndarray, "t 3"] | None
+) -> tuple[Float[np.ndarray, "1 3"], tuple[str, ...]]:
+    """Return what is subtracted from all poses, and what must be said of it."""
+    poses = mapped if truth is None else np.concatenate([mapped, truth])
+    if np.abs(poses[:, :2]).max() <= FAR_M:
+        return np.zeros((1, 3)), ()
+    x, y = mapped[0, :2]
+    said = f"local origin: x = {x:.6f} m and y = {y:.6f} m were subtracted from all positions"
+    return np.array([[x, y, 0.0]]), (said,)
 
 
 def _copy_rows(rows: np.ndarray, path: Path) -> None:

@@ -7,6 +7,7 @@ dbStruct      one .mat or .db of NetVLAD and seqNet
 traverse      poses.csv and perhaps odometry.csv: one drive
 """
 
+import io
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from jaxtyping import Float
 from taojax.datasets.folder import Session
 from taojax.datasets.trajectory import Trajectory, headings, integrate
 from taojax.errors import InputError
-from taojax.specs import fail, load_spec
+from taojax.specs import fail, load_spec, read_bytes
 from taojax.tables import read_table
 
 __all__ = ["read_plain", "read_traverse"]
@@ -217,10 +218,12 @@ def _load_struct(path: Path) -> dict[str, Any]:
     from scipy.io.matlab import MatReadError
 
     spec = load_spec("seqnet")
+    raw = io.BytesIO(read_bytes(path))
     try:
-        held = loadmat(path, simplify_cells=True, appendmat=False)
+        held = loadmat(raw, simplify_cells=True, appendmat=False)
     except (ValueError, TypeError, KeyError, IndexError, OSError, EOFError, OverflowError,
-            NotImplementedError, MemoryError, MatReadError, zlib.error) as error:  # fmt: skip
+            NotImplementedError, MemoryError, UnboundLocalError, MatReadError,
+            zlib.error) as error:  # fmt: skip
         lines = str(error).splitlines() or [type(error).__name__]
         raise fail(
             path, f"is not a MATLAB v5 file ({lines[0][:80]})", "save it with -v7"

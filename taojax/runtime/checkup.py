@@ -117,7 +117,7 @@ def _descriptors(found: Found, folder: Path, name: str, stamps: np.ndarray | Non
 def _parse(path: Path) -> None:
     try:
         tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise fail(path, f"is not TOML ({error})", "expected notes = [...]") from error
 
 

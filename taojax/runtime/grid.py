@@ -126,8 +126,10 @@ def read_grid(path: Path) -> Grid:
         ConfigError: unreadable, or not what `parse` allows; one line that names the file.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("is not a file")
         return parse(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read as TOML: {error}") from error
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error

@@ -54,4 +54,22 @@ def run(args: Closures) -> None:
     print(f"rejected.g2o    {n['reject']} rejected ones, to look at")
     print(f"trajectory.tum  {trajectory.count(chr(10))} accepted poses")
     print(f"left out        {n['abstain']} poses on which nothing was decided")
+    if told := _of_the_audit(args.run):
+        print(told)
     say(f"written to {folder}")
+
+
+def _of_the_audit(run: Path) -> str | None:
+    """Say how far accepted frames could be believed where the run was judged."""
+    from taojax.tables import read_table
+
+    if not all((run / name).is_file() for name in ("labels.csv", "verdicts.csv")):
+        return None
+    labels = read_table(run / "labels.csv", "labels")
+    accepted = read_table(run / "verdicts.csv", "verdicts")["verdict"] == "accept"
+    is_test = accepted & (labels["split"] == "test")
+    n, n_off = int(is_test.sum()), int((is_test & (labels["label"] == "map_out")).sum())
+    return (
+        f"audit           {n_off} of the {n} accepted frames of the test half lie off the map; give"
+        " closures a robust kernel"
+    )
