@@ -35,7 +35,8 @@ def test_the_threshold_of_a_probability_accepts_95_percent_of_the_in_map_frames(
     label = np.array(["in_map"] * 20 + ["map_out"])
     split = split_of({"fused": np.r_[np.linspace(0.05, 0.97, 20), 0.99]}, label)
     threshold = calibration.sigma_threshold(split, "fused", 3.0, is_probability=True)
-    assert threshold == np.linspace(0.05, 0.97, 20)[18]
+    assert threshold == pytest.approx(np.linspace(0.05, 0.97, 20)[18], rel=2e-6)
+    assert threshold > np.linspace(0.05, 0.97, 20)[18]
 
 
 def test_there_is_no_threshold_without_an_in_map_frame():
