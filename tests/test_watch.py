@@ -233,10 +233,15 @@ def test_a_folder_without_a_map_is_exit_3(tmp_path, capsys):
 def start(folder):
     words = ["watch", str(folder / "data"), "--config", str(folder / "config.toml")]
     words += ["--calibration", str(folder / "calibration.toml")]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "taojax", *words], env=os.environ | {"JAX_PLATFORMS": "cpu"},
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    # A runner in the background ignores interrupts, and its children would inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "taojax", *words], env=os.environ | {"JAX_PLATFORMS": "cpu"},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert child.stderr.readline().startswith(b"ready: map of 60 places")
     return child
 
