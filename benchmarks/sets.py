@@ -23,7 +23,7 @@ from taojax.runtime.observations import load_observations
 from taojax.runtime.retrieval import dense, retrieve
 from taojax.runtime.rivals import dense_lists
 from taojax.runtime.score import candidates
-from taojax.tables import read_table
+from taojax.tables import MOTION, read_table, stacked
 
 REAL = {"mit_corridor": (5.0, 10.0), "intel_lab": (1.5, 3.0), "tuc_corridor_mapout": (2.0, 4.0)}
 """Real recordings -> r_in, r_out [m]."""
@@ -158,7 +158,7 @@ def robotcar_route(folder: Path, traverse: str, seed: int) -> DataSet:
     map_poses = read_poses(folder / ROBOTCAR_MAP / "poses.csv", "map_poses")
     query = read_poses(folder / traverse / "poses.csv", "query_poses")
     table = read_table(folder / traverse / "odometry.csv", "query_odometry")
-    odometry = np.stack([table[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
+    odometry = stacked(table, MOTION)
     log = _Log(map_poses[:, 1:], odometry, query[:, 1:3], query[:, 1:3])
     names = (
         f"robotcar_vo/{traverse[:10]}",

@@ -171,20 +171,28 @@ def _typed(name: str, value: object, default: object) -> object:
     return value
 
 
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a file of settings.
+
+    Raises:
+        ConfigError: it cannot be read, or is not TOML.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError("is not a file")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: cannot be read as TOML: {error}") from error
+
+
 def from_toml(path: Path) -> Config:
     """Read settings; what the file leaves out keeps its default.
 
     Raises:
         ConfigError: unreadable file, unknown table or key, wrong type, value out of range.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise OSError("is not a file")
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read as TOML: {error}") from error
     parts: dict[str, Any] = {}
-    for name, value in tree.items():
+    for name, value in read_toml(path).items():
         if name == "seed":
             parts[name] = _typed(name, value, 0)
             continue

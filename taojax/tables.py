@@ -10,6 +10,17 @@ import numpy as np
 from taojax.errors import InputError
 from taojax.specs import fail, load_spec, read_text
 
+POSE = ("x_m", "y_m", "theta_rad")
+"""Columns of a pose."""
+
+MOTION = ("dx_m", "dy_m", "dtheta_rad")
+"""Columns of the odometry into a frame."""
+
+
+def stacked(table: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    """Return columns of numbers side by side, (rows, columns) float64; a missing name is a bug."""
+    return np.stack([np.asarray(table[name], float) for name in names], axis=1)
+
 
 def _cell(path: Path, row: int, column: Mapping[str, Any], text: str) -> float | int | str:
     """Return one checked cell; `row` is the line number an editor shows."""

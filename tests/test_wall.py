@@ -43,10 +43,10 @@ CHEATS = {
     ),
     "a loader opens truth": (
         "runtime/observations.py",
-        "    motion = np.stack(",
+        "    motion = stacked(",
         '    hint = folder / "truth/query_poses.csv"\n'
         "    odometry['dx_m'] += hint.stat().st_size if hint.exists() else 0\n"
-        "    motion = np.stack(",
+        "    motion = stacked(",
     ),
     "the future leaks in": (
         "runtime/score.py",

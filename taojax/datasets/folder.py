@@ -12,18 +12,15 @@ from jaxtyping import Float, Int
 
 from taojax.datasets.trajectory import Trajectory
 from taojax.errors import InputError
-from taojax.tables import table_text
+from taojax.tables import MOTION, POSE, table_text
 
-__all__ = ["Descriptors", "Lists", "Session", "write_folder"]
+__all__ = ["Descriptors", "Lists", "Session", "stamped_text", "write_folder"]
 
 BLOCK_ROWS = 4096
 """Descriptors are copied so many at a time: a map may be larger than the memory."""
 
 FAR_M = 1e5
 """Coordinates farther from the origin lose centimetres in float32."""
-
-POSE = ("t_s", "x_m", "y_m", "theta_rad")
-ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
 
 
 @dataclass(frozen=True)
@@ -99,12 +96,14 @@ def write_folder(
             (part / name).mkdir(parents=True)
         origin, moved = _origin(mapped.xyt, truth)
         files = {
-            "map/poses.csv": _table("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
-            "query/odometry.csv": _table("query_odometry", ODOMETRY, *query),
+            "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
+            "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
             "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n",
         }
         if truth is not None:
-            files["truth/query_poses.csv"] = _table("query_poses", POSE, query[0], truth - origin)
+            files["truth/query_poses.csv"] = stamped_text(
+                "query_poses", POSE, query[0], truth - origin
+            )
         for name, text in files.items():
             (part / name).write_text(text, encoding="utf-8")
         if isinstance(views, Lists):
@@ -121,8 +120,16 @@ def write_folder(
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _table(spec: str, names: Sequence[str], t_s: np.ndarray, columns: np.ndarray) -> str:
-    return table_text(spec, dict(zip(names, (t_s, *columns.T), strict=True)))
+def stamped_text(spec: str, names: Sequence[str], t_s: np.ndarray, rows: np.ndarray) -> str:
+    """Return a table of stamped rows as CSV text.
+
+    Args:
+        spec: in data_specs/.
+        names: columns behind `t_s`.
+        t_s: (n,) seconds.
+        rows: (n, columns).
+    """
+    return table_text(spec, dict(zip(("t_s", *names), (t_s, *rows.T), strict=True)))
 
 
 def _origin(

@@ -7,17 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from taojax.about import read_about
+from taojax.datasets.folder import stamped_text
 from taojax.datasets.kidnap import LEVELS, TRIAL_FRAMES, WINDOW_FRAMES, Log, Source
 from taojax.datasets.simulate import make_world, seen_places
 from taojax.datasets.world import NOTE, WorldConfig
 from taojax.errors import InputError
 from taojax.specs import read_npy, read_npz, write_atomically
-from taojax.tables import read_table, table_text
+from taojax.tables import MOTION, POSE, read_table, stacked, table_text
 
 __all__ = ["folder_source", "read_poses", "world_source", "write_logs"]
-
-_POSE = ("t_s", "x_m", "y_m", "theta_rad")
-_ODOMETRY = ("t_s", "dx_m", "dy_m", "dtheta_rad")
 
 
 def world_source(config: WorldConfig, seed: int) -> Source:
@@ -43,8 +41,7 @@ def read_poses(path: Path, spec: str) -> np.ndarray:
     Raises:
         InputError: the table is missing or malformed.
     """
-    table = read_table(path, spec)
-    return np.stack([table[name] for name in _POSE], axis=1)
+    return stacked(read_table(path, spec), ("t_s", *POSE))
 
 
 def folder_source(folder: Path) -> Source:
@@ -91,12 +88,6 @@ def _said(source: Source, logs: Sequence[Log]) -> list[str]:
     ]
 
 
-def _stacked(
-    stamps: np.ndarray, columns: np.ndarray, names: Sequence[str]
-) -> dict[str, np.ndarray]:
-    return dict(zip(names, (stamps, *columns.T), strict=True))
-
-
 def write_logs(source: Source, logs: Sequence[Log], folder: Path) -> None:
     """Write logs one after another as a data folder with its truth.
 
@@ -114,11 +105,11 @@ def write_logs(source: Source, logs: Sequence[Log], folder: Path) -> None:
     odometry = np.concatenate([log.odometry for log in logs])
     truth = source.query_poses[rows]
     files = {
-        "map/poses.csv": table_text(
-            "map_poses", _stacked(source.map_poses[:, 0], source.map_poses[:, 1:], _POSE)
+        "map/poses.csv": stamped_text(
+            "map_poses", POSE, source.map_poses[:, 0], source.map_poses[:, 1:]
         ),
-        "query/odometry.csv": table_text("query_odometry", _stacked(stamps, odometry, _ODOMETRY)),
-        "truth/query_poses.csv": table_text("query_poses", _stacked(stamps, truth[:, 1:], _POSE)),
+        "query/odometry.csv": stamped_text("query_odometry", MOTION, stamps, odometry),
+        "truth/query_poses.csv": stamped_text("query_poses", POSE, stamps, truth[:, 1:]),
         "truth/kidnaps.csv": table_text("kidnaps", _kidnaps(logs)),
         "truth/logs.csv": table_text("logs", _log_table(logs)),
         "about.toml": f"trial_frames = {TRIAL_FRAMES}\n"
@@ -126,7 +117,7 @@ def write_logs(source: Source, logs: Sequence[Log], folder: Path) -> None:
     }
     if source.seen_m is not None:
         seen = np.concatenate([source.seen_m[rows], truth[:, 3:]], axis=1)
-        files["truth/seen_poses.csv"] = table_text("query_poses", _stacked(stamps, seen, _POSE))
+        files["truth/seen_poses.csv"] = stamped_text("query_poses", POSE, stamps, seen)
     for name, text in files.items():
         write_atomically(folder / name, text)
     if source.map_views is None:

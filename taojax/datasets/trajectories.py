@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from taojax.datasets.trajectory import Trajectory, motions
 from taojax.specs import fail, read_text
-from taojax.tables import read_table
+from taojax.tables import POSE, read_table, stacked
 
 __all__ = [
     "Kind", "Plane", "check_seconds", "flat_poses", "looks_like", "read_trajectory", "rotations",
@@ -89,9 +89,9 @@ def read_trajectory(
     else:
         check_seconds(path, t_s := table["t_s"], where)
     if kind == "csv":
-        return Trajectory(t_s, _columns(table, "x_m y_m theta_rad"))
-    rotation = rotations(path, _columns(table, "qx qy qz qw"), where)
-    xyt = flat_poses(path, _columns(table, "x_m y_m z_m"), rotation, plane or "xy", where)
+        return Trajectory(t_s, stacked(table, POSE))
+    rotation = rotations(path, stacked(table, ["qx", "qy", "qz", "qw"]), where)
+    xyt = flat_poses(path, stacked(table, ["x_m", "y_m", "z_m"]), rotation, plane or "xy", where)
     return Trajectory(t_s, xyt)
 
 
@@ -234,20 +234,18 @@ def _apart(xyz: np.ndarray) -> list[int]:
     return chosen
 
 
-def _columns(table: dict[str, np.ndarray], names: str) -> np.ndarray:
-    return np.stack([table[name] for name in names.split()], axis=1)
-
-
 def _read_kitti(path: Path, times: Path | None, plane: Plane) -> Trajectory:
     table = read_table(path, "kitti")
     n = len(table["x_m"])
     where = partial(row_of, path, n)
-    rotation = _columns(table, "r11 r12 r13 r21 r22 r23 r31 r32 r33").reshape(n, 3, 3)
+    rotation = stacked(
+        table, ["r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"]
+    ).reshape(n, 3, 3)
     away = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)[None]).max(axis=(1, 2))
     if (odd := np.flatnonzero((away > UNIT_LENGTH) | (np.linalg.det(rotation) < 0))).size:
         what = f"{where(int(odd[0]))}: the first three columns are no rotation"
         raise fail(path, what, "store 3 x 4 matrices row by row: r11 r12 r13 x r21 ...")
-    xyt = flat_poses(path, _columns(table, "x_m y_m z_m"), rotation, plane, where)
+    xyt = flat_poses(path, stacked(table, ["x_m", "y_m", "z_m"]), rotation, plane, where)
     frame = table.get("frame", np.arange(n, dtype=float))
     check_seconds(path, frame, where)
     if times is None:

@@ -2,14 +2,13 @@
 
 import itertools
 import math
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from taojax.config import StreamConfig
+from taojax.config import StreamConfig, read_toml
 from taojax.errors import ConfigError
 
 RANK = (
@@ -125,12 +124,9 @@ def read_grid(path: Path) -> Grid:
     Raises:
         ConfigError: unreadable, or not what `parse` allows; one line that names the file.
     """
+    tree = read_toml(path)
     try:
-        if path.exists() and not path.is_file():
-            raise OSError("is not a file")
-        return parse(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read as TOML: {error}") from error
+        return parse(tree)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 

@@ -11,7 +11,7 @@ from taojax.about import read_about
 from taojax.errors import InputError
 from taojax.records import digest_file
 from taojax.specs import read_npy, read_npz
-from taojax.tables import read_table
+from taojax.tables import MOTION, POSE, read_table, stacked
 
 DESCRIPTORS = (
     ("map/descriptors.npy", "query/descriptors.npy"),
@@ -64,7 +64,7 @@ class Observations:
     @property
     def map_xyt(self) -> np.ndarray:
         """(M, 3) map poses: x [m], y [m], theta [rad]."""
-        return np.stack([self.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+        return stacked(self.map_poses, POSE)
 
 
 def _check_rows(path: Path, n_rows: int, n_wanted: int, other: Path) -> None:
@@ -194,7 +194,7 @@ def load_observations(folder: Path) -> Observations:
         files += names
     notes, trial_frames = read_about(folder, n_query)
     files += ["about.toml"] if (folder / "about.toml").exists() else []
-    motion = np.stack([odometry[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
+    motion = stacked(odometry, MOTION)
     return Observations(
         map_poses=map_poses,
         t_s=odometry["t_s"],
