@@ -14,11 +14,11 @@ from taojax.audit import calibration, labels, sequential
 from taojax.baselines.frames import Frames
 from taojax.config import Config, StreamConfig
 from taojax.core.adaptive import adaptive_mean
+from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.rivals import SYSTEMS
 from taojax.runtime.scale import LEAST_RANGE
 from taojax.runtime.score import replay_log
-from taojax.runtime.stream import Frame, StreamRecord
 
 OURS = ("tao", "tao_align", "recursive", "tao_rank")
 """Columns of our stream that compete."""

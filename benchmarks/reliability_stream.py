@@ -9,8 +9,9 @@ import numpy as np
 
 from benchmarks.reliability_targets import from_tests
 from taojax.config import StreamConfig
+from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.stream import Frame, StreamRecord, StreamState, init, replay, step
+from taojax.runtime.stream import StreamState, init, replay, step
 
 CHUNK = 1000
 REMEMBERS = (
@@ -162,7 +163,7 @@ def count_differing(association: str, kind: str, at: int = 30, n: int = 100) -> 
     """Return how many numbers of records and state differ between a broken and an empty frame."""
     config = CONFIGS[association]
     tables, frames = recording(n)
-    ends = [replay(config, tables, log) for log in broken(frames, at, kind)]
+    ends = [replay(config, tables, log, init(config, tables)) for log in broken(frames, at, kind)]
     same = jax.tree.map(lambda a, b: int((a != b).sum()), *ends)
     return sum(jax.tree.leaves(same))
 

@@ -22,10 +22,10 @@ import numpy as np
 from taojax.config import StreamConfig
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world
+from taojax.runtime.frames import Frame
 from taojax.runtime.grid import DEFAULT, Grid, Row, expand
 from taojax.runtime.maps import map_tables
 from taojax.runtime.retrieval import retrieve
-from taojax.runtime.stream import Frame
 from taojax.runtime.sweep import JointUnit, at_once, evaluate, plan
 
 BATCHES = (1, 4, 16)

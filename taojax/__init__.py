@@ -12,24 +12,16 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from taojax.config import Config, StreamConfig
     from taojax.errors import ConfigError, InputError, TaojaxError
+    from taojax.runtime.frames import STATUSES, Frame, StreamRecord
     from taojax.runtime.maps import MapTables, map_tables
-    from taojax.runtime.stream import (
-        STATUSES,
-        Frame,
-        StreamRecord,
-        StreamState,
-        init,
-        replay,
-        step,
-    )
+    from taojax.runtime.stream import StreamState, init, replay, step
 
 _HOMES = {
     "taojax.config": ("Config", "StreamConfig"),
     "taojax.errors": ("ConfigError", "InputError", "TaojaxError"),
     "taojax.runtime.maps": ("MapTables", "map_tables"),
-    "taojax.runtime.stream": (
-        "STATUSES", "Frame", "StreamRecord", "StreamState", "init", "replay", "step",
-    ),
+    "taojax.runtime.frames": ("STATUSES", "Frame", "StreamRecord"),
+    "taojax.runtime.stream": ("StreamState", "init", "replay", "step"),
 }  # fmt: skip
 
 __all__ = [

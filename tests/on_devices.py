@@ -12,8 +12,8 @@ import numpy as np
 
 from taojax.config import Config, StreamConfig
 from taojax.runtime import retrieval, trials
+from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
-from taojax.runtime.stream import Frame
 
 K = 20
 

@@ -9,6 +9,7 @@ from conftest import loop
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from taojax.core.anchors import look_up, pool
 from taojax.core.association import (
     JointParams,
     JointWindow,
@@ -16,9 +17,7 @@ from taojax.core.association import (
     evaluate,
     find,
     joint_branch,
-    look_up,
     objective,
-    pool,
     refit,
 )
 from taojax.core.se2 import inverse, transform

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from taojax.core.association import look_up
+from taojax.core.anchors import look_up
 from taojax.runtime.maps import map_tables
 
 

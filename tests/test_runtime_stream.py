@@ -11,8 +11,9 @@ from conftest import loop, motions
 from taojax.config import Config, StreamConfig
 from taojax.records import signal_names
 from taojax.runtime import score
+from taojax.runtime.frames import STATUSES, Frame
 from taojax.runtime.maps import MapTables, map_spacing_m, map_tables
-from taojax.runtime.stream import STATUSES, Frame, init, replay, step
+from taojax.runtime.stream import init, replay, step
 
 SMALL = StreamConfig(window=8, branches=6, joint_window=8, joint_seeds=4)
 RANK = StreamConfig(window=8, branches=6, association="rank")

@@ -13,9 +13,9 @@ from taojax.cli import main
 from taojax.config import Config, StreamConfig, replace
 from taojax.errors import InputError
 from taojax.runtime import rivals
+from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.score import replay_log, score
-from taojax.runtime.stream import Frame
 from taojax.runtime.trials import in_trials, replay_trials
 
 SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))

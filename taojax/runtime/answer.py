@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
 from taojax.core.adaptive import adaptive_mean
-from taojax.core.association import look_up
+from taojax.core.anchors import look_up
 from taojax.core.cost import BranchCost, squared_residuals
 from taojax.core.sums import over_frames
 from taojax.runtime.choice import since_support

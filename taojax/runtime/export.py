@@ -21,10 +21,11 @@ from jax import export
 from taojax.config import Config, StreamConfig, to_toml
 from taojax.errors import MissingExtraError
 from taojax.records import SCHEMA, digest, publish, refuse_if_taken, seal_of
+from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import load_observations
 from taojax.runtime.score import candidates
-from taojax.runtime.stream import STATUSES, Frame, StreamRecord, StreamState, init, step
+from taojax.runtime.stream import StreamState, init, step
 
 EXAMPLE_FRAMES = 64
 """First frames of the data that travel with the artefact, with what `step` says of them."""

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.association import JointWindow, joint_branch
 from taojax.core.cost import Branch, branch_cost, huber, squared_residuals
-from taojax.core.se2 import compose, transform
+from taojax.core.se2 import transform
 from taojax.core.sums import least, over_frames
-from taojax.runtime.joint import joint_params, joint_step, seeds_of
+from taojax.runtime.frames import Frame
+from taojax.runtime.joint import follow, joint_step
 from taojax.runtime.maps import MapTables
 from taojax.runtime.scale import rescale
-from taojax.runtime.stream import Frame, StreamState, clean, cost_params
+from taojax.runtime.stream import StreamState, clean, cost_params
 
 
 class Inside(NamedTuple):
@@ -63,32 +63,21 @@ def joint_inside(
     assert before.memory is not None  # noqa: S101 - for the type checker: joint streams have one
     odometry, index, similarity = clean(config, tables, frame)
     scaled, old = rescale(tables.scale, similarity), before.memory.joint
-    new, reading = joint_step(config, tables, old, odometry, index, scaled)
-    n = config.joint_window
-    age = jnp.mod(old.slot - jnp.arange(n), n)
-    decay = jnp.where(new.is_filled, jnp.exp(-age.astype(jnp.float32) / config.memory_frames), 0.0)
-    weight = decay / over_frames(decay)
-    window = JointWindow(new.p, weight, new.listed, new.similarity, new.pooled)
-    seeds = seeds_of(
-        config, tables, index, compose(old.carried, jnp.broadcast_to(odometry, (2, 3)))
-    )
-    n_lists = min(config.joint_seeds, index.shape[0])
-    is_seed = index[:n_lists] >= 0
+    seen = follow(config, tables, old, odometry, index, scaled)
+    best = joint_step(config, tables, old, odometry, index, scaled)[1].best
     # The challenger answers for jumps alone, as in `joint_step`.
-    carried = jnp.stack([old.has_carried, jnp.zeros((), bool)])
-    is_live = jnp.concatenate([is_seed, is_seed, carried])
-    follow = jax.vmap(joint_branch, in_axes=(None, None, None, 0))
-    every = follow(joint_params(config, tables), tables.grid, window, seeds)
-    order, best = jnp.mod(old.slot - jnp.arange(n), n), reading.best
+    is_told = seen.is_live.at[-1].set(False)
+    n = config.joint_window
+    order = jnp.mod(old.slot - jnp.arange(n), n)
     return Inside(
-        is_filled=new.is_filled[order],
-        path_m=transform(best.T_map_odom[None], new.p[order]),
+        is_filled=seen.is_filled[order],
+        path_m=transform(best.T_map_odom[None], seen.window.p[order]),
         anchor=best.anchor[::-1],
         cost=best.frame_cost[::-1],
-        weight=weight[order],
+        weight=seen.window.weight[order],
         is_inlier=best.is_inlier[::-1],
-        branch_cost=jnp.where(is_live | ~jnp.any(is_live), every.cost, jnp.inf),
-        branch_pose=every.T_map_odom,
+        branch_cost=jnp.where(is_told, seen.branches.cost, jnp.inf),
+        branch_pose=seen.branches.T_map_odom,
     )
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from taojax.config import StreamConfig
-from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch, pool
+from taojax.core.anchors import pool
+from taojax.core.association import JointBranch, JointParams, JointWindow, joint_branch
 from taojax.core.se2 import compose, inverse, transform
 from taojax.core.sums import least, over_frames
 from taojax.runtime.choice import Report, report
@@ -104,6 +105,66 @@ def seeds_of(
     return jnp.concatenate([ahead, back, carried])
 
 
+class Followed(eqx.Module):
+    """Every hypothesis of one frame, followed through the window."""
+
+    window: JointWindow
+    """Frames at their places in the ring."""
+
+    is_filled: Bool[Array, " n"]
+    age: Int[Array, " n"]
+    """Frames since, in the ring."""
+
+    branches: JointBranch
+    """Leading axis: newest candidates ahead, the same backwards, the two carried poses."""
+
+    is_live: Bool[Array, " s"]
+    """False for seeds that are none."""
+
+    has_candidate: Bool[Array, ""]
+
+
+def follow(
+    config: StreamConfig,
+    tables: MapTables,
+    state: JointState,
+    odometry: Float[Array, "3"],
+    index: Int[Array, " c"],
+    scaled: Float[Array, " c"],
+) -> Followed:
+    """Take one frame into the window and follow every hypothesis through it.
+
+    Args:
+        config: settings.
+        tables: the map.
+        state: memory before the frame.
+        odometry: motion into this frame, finite.
+        index: `(c,)` candidates, best first, -1 = none.
+        scaled: `(c,)` their similarities on the fixed scale.
+    """
+    n, slot = config.joint_window, state.slot
+    p = transform(inverse(odometry)[None], state.p).at[slot].set(0.0)
+    listed = state.listed.at[slot].set(index)
+    similarity = state.similarity.at[slot].set(scaled)
+    pooled = state.pooled.at[slot].set(pool(tables.grid, GAMMA, index, scaled))
+    is_filled = state.is_filled.at[slot].set(True)
+    age = jnp.mod(slot - jnp.arange(n), n)
+    decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
+    window = JointWindow(p, decay / over_frames(decay), listed, similarity, pooled)
+
+    carried = compose(state.carried, jnp.broadcast_to(odometry, (2, 3)))
+    seeds = seeds_of(config, tables, index, carried)
+    n_lists = min(config.joint_seeds, index.shape[0])
+    is_seed = index[:n_lists] >= 0
+    # Without any candidate and history the first anchor is as good a guess as any.
+    is_live = jnp.concatenate([is_seed, is_seed, jnp.repeat(state.has_carried, 2)])
+    branches = jax.vmap(joint_branch, in_axes=(None, None, None, 0))(
+        joint_params(config, tables), tables.grid, window, seeds
+    )
+    is_live = is_live | ~jnp.any(is_live)
+    return Followed(window, is_filled, age, branches, is_live, jnp.any(is_seed))
+
+
 def joint_step(
     config: StreamConfig,
     tables: MapTables,
@@ -126,51 +187,37 @@ def joint_step(
         The memory and the reading.
     """
     n, params = config.joint_window, joint_params(config, tables)
-    slot = state.slot
-    p = transform(inverse(odometry)[None], state.p).at[slot].set(0.0)
-    listed = state.listed.at[slot].set(index)
-    similarity = state.similarity.at[slot].set(scaled)
-    pooled = state.pooled.at[slot].set(pool(tables.grid, GAMMA, index, scaled))
-    is_filled = state.is_filled.at[slot].set(True)
-    age = jnp.mod(slot - jnp.arange(n), n)
-    decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
-    window = JointWindow(p, decay / over_frames(decay), listed, similarity, pooled)
-
-    carried = compose(state.carried, jnp.broadcast_to(odometry, (2, 3)))
-    seeds = seeds_of(config, tables, index, carried)
-    n_lists = min(config.joint_seeds, index.shape[0])
-    is_seed = index[:n_lists] >= 0
-    # Without any candidate and history the first anchor is as good a guess as any.
-    is_live = jnp.concatenate([is_seed, is_seed, jnp.repeat(state.has_carried, 2)])
-    branches = jax.vmap(joint_branch, in_axes=(None, None, None, 0))(
-        params, tables.grid, window, seeds
-    )
-    is_live = is_live | ~jnp.any(is_live)
+    seen = follow(config, tables, state, odometry, index, scaled)
+    branches, window = seen.branches, seen.window
     # The challenger answers for jumps alone: one more guess would make every place look better.
-    cost = jnp.where(is_live, branches.cost, jnp.inf).at[-1].set(jnp.inf)
+    cost = jnp.where(seen.is_live, branches.cost, jnp.inf).at[-1].set(jnp.inf)
     winner = least(cost)
     best: JointBranch = jax.tree.map(lambda leaf: leaf[winner], branches)
     gap = branches.T_map_odom[:, :2] - best.T_map_odom[None, :2]
     is_elsewhere = gap[:, 0] ** 2 + gap[:, 1] ** 2 > (DISTINCT_DELTAS * params.delta_m) ** 2
     rival = jnp.minimum(GAMMA, jnp.min(jnp.where(is_elsewhere, cost, GAMMA)))
-    said = report(params, tables.grid.xy, window, branches, winner, is_live, age, tables.recall)
+    said = report(
+        params, tables.grid.xy, window, branches, winner, seen.is_live, seen.age, tables.recall
+    )
 
     # The ring read from its oldest slot to its newest.
-    order = jnp.mod(slot + 1 + jnp.arange(n), n)
+    order = jnp.mod(state.slot + 1 + jnp.arange(n), n)
     in_time = eqx.tree_at(
         lambda b: (b.anchor, b.frame_cost, b.is_inlier),
         best,
         (best.anchor[order], best.frame_cost[order], best.is_inlier[order]),
     )
-    has_carried = state.has_carried | jnp.any(is_seed)
+    has_carried = state.has_carried | seen.has_candidate
     state = JointState(
-        p=p,
-        listed=listed,
-        similarity=similarity,
-        pooled=pooled,
-        is_filled=is_filled,
-        slot=jnp.mod(slot + 1, n),
+        p=window.p,
+        listed=window.listed,
+        similarity=window.similarity,
+        pooled=window.pooled,
+        is_filled=seen.is_filled,
+        slot=jnp.mod(state.slot + 1, n),
         carried=jnp.stack([best.T_map_odom, said.challenger]),
         has_carried=has_carried,
     )
-    return state, JointReading(in_time, said, rival, has_carried, is_filled[order], p[order])
+    return state, JointReading(
+        in_time, said, rival, has_carried, seen.is_filled[order], window.p[order]
+    )

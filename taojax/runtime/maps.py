@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import KDTree
 
 from taojax.config import StreamConfig
-from taojax.core.association import AnchorGrid
+from taojax.core.anchors import AnchorGrid
 from taojax.detector import LIST_RECALL
 from taojax.runtime.scale import LIST_SCALE, MapView, view_map
 

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from taojax.core.association import AnchorGrid, look_up
+from taojax.core.anchors import AnchorGrid, look_up
 from taojax.core.se2 import rotate
 from taojax.core.sums import least
 from taojax.runtime.maps import MapTables

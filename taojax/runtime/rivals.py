@@ -14,9 +14,9 @@ from taojax.baselines.sequence import seqslam, sue
 from taojax.baselines.topometric import TopometricParams, topometric
 from taojax.baselines.trajectory_prior import trajectory_prior
 from taojax.records import SealedTrack
+from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.observations import Observations
 from taojax.runtime.retrieval import dense
-from taojax.runtime.stream import Frame, StreamRecord
 
 
 class Said(Protocol):

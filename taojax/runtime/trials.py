@@ -6,9 +6,10 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from taojax.config import Config, StreamConfig
+from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.maps import MapTables
 from taojax.runtime.parallel import CUT, WHOLE, device_mesh, gather, place
-from taojax.runtime.stream import Frame, StreamRecord, replay
+from taojax.runtime.stream import replay
 
 CHUNK_TRIALS = 32
 """Trials per call and device; one compilation, and a progress bar that moves."""
