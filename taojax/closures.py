@@ -18,7 +18,7 @@ from taojax.detector import from_toml as read_detector
 from taojax.errors import InputError
 from taojax.records import Run
 from taojax.specs import fail, read_text
-from taojax.tables import read_table
+from taojax.tables import MOTION, POSE, read_table, stacked
 
 __all__ = ["Graph", "Verdicts", "build_graph", "g2o_text", "read_verdicts", "tum_text"]
 
@@ -179,9 +179,9 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
         what = "lacks odometry.csv or map_spacing_m, sealed by newer versions"
         raise InputError(f"{folder}: {what}; score the data set again with `taojax score`")
     table = read_table(folder / "odometry.csv", "query_odometry")
-    odometry = np.stack([table[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
+    odometry = stacked(table, MOTION)
     signals, poses = run.signals, run.map_poses
-    pose = np.stack([signals[c].astype(float) for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    pose = stacked(signals, POSE)
     is_accepted = (verdicts.verdict == "accept") & np.isfinite(pose[:, 0])
     n = len(odometry)
     is_start = np.arange(n) % (facts.get("trial_frames") or n) == 0
@@ -189,7 +189,7 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
     spacing_m = float(facts["map_spacing_m"])
     delta = float(settings.delta_spacings)
     return Graph(
-        map_pose=np.stack([poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1),
+        map_pose=stacked(poses, POSE),
         query_pose=_chained(odometry, np.where(is_accepted[:, None], pose, np.nan), is_start),
         t_s=table["t_s"],
         odometry=odometry,

@@ -23,6 +23,23 @@ LIST_RECALL = 0.75
 nor sure."""
 
 
+SAME_RECALL = 0.01
+"""Recalls nearer than this speak of the same descriptors."""
+
+
+class MapFacts(NamedTuple):
+    """Which map a detector was fitted on, told by what both sides can measure."""
+
+    poses_sha256: str
+    """Of map/poses.csv."""
+
+    spacing_m: float
+    """Median distance between neighbours."""
+
+    recall: float
+    """Share of map images whose most similar other image lies nearby."""
+
+
 class Detector(NamedTuple):
     """Everything that `probability` needs."""
 
@@ -30,6 +47,9 @@ class Detector(NamedTuple):
     """Signals it reads."""
 
     mean: Float[np.ndarray, " f"]
+    """Of each signal over the in-map calibration frames, over all where none is: what its term is
+    measured from."""
+
     scale: Float[np.ndarray, " f"]
     weight: Float[np.ndarray, " f"]
     """Log odds per standardised signal."""
@@ -41,11 +61,14 @@ class Detector(NamedTuple):
     note: str
     """How it was fitted, in words."""
 
+    fitted_on: MapFacts | None = None
+    """None where the run did not say."""
+
 
 def log_odds_terms(
     detector: Detector, signals: Mapping[str, np.ndarray]
 ) -> Float[np.ndarray, "t f"]:
-    """Return what each signal adds to the log odds of each frame."""
+    """Return what each signal adds to the log odds of each frame above the mean in-map frame's."""
     table = np.stack([np.asarray(signals[name], float) for name in detector.columns], axis=1)
     return (table - detector.mean[None]) / detector.scale[None] * detector.weight[None]
 
@@ -62,6 +85,30 @@ def probability(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[
     return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
 
 
+def foreign_map(detector: Detector, here: MapFacts) -> str | None:
+    """Say so where a detector was fitted on another map than the one at hand.
+
+    Args:
+        detector: frozen numbers.
+        here: the map that it is about to judge.
+
+    Returns:
+        One sentence; None where the map is the same, or nobody knows.
+    """
+    then = detector.fitted_on
+    if then is None:
+        return None
+    is_same = then.poses_sha256 == here.poses_sha256
+    if is_same and abs(then.recall - here.recall) <= SAME_RECALL:
+        return None
+    what = "another map" if not is_same else "other descriptors of this map"
+    told = lambda facts: f"spacing {facts.spacing_m:.3g} m and recall {facts.recall:.2f}"
+    return (
+        f"the calibration was fitted on {what} ({told(then)}; here {told(here)}): how many wrong"
+        " frames its threshold accepts here is unknown until this place is audited"
+    )
+
+
 def to_toml(detector: Detector) -> str:
     """Return the text of a calibration file."""
     lines = [
@@ -73,7 +120,16 @@ def to_toml(detector: Detector) -> str:
         lines.append(f"{name} = [{values}]")
     lines += [f"bias = {float(detector.bias)!r}", f"threshold = {float(detector.threshold)!r}"]
     note = detector.note.replace("\\", "/").replace('"', "'")
-    return "\n".join([*lines, f'note = "{note}"']) + "\n"
+    lines.append(f'note = "{note}"')
+    if (facts := detector.fitted_on) is not None:
+        lines += [
+            "",
+            "[map]",
+            f'poses_sha256 = "{facts.poses_sha256}"',
+            f"spacing_m = {float(facts.spacing_m)!r}",
+            f"recall = {float(facts.recall)!r}",
+        ]
+    return "\n".join(lines) + "\n"
 
 
 def from_toml(path: Path) -> Detector:
@@ -88,7 +144,12 @@ def from_toml(path: Path) -> Detector:
         columns = tuple(tree["columns"])
         vectors = [np.array(tree[name], float) for name in ("mean", "scale", "weight")]
         bias, threshold = float(tree["bias"]), float(tree["threshold"])
-        note = str(tree["note"])
+        note, seen = str(tree["note"]), tree.get("map")
+        fitted_on = None
+        if seen is not None:
+            fitted_on = MapFacts(
+                str(seen["poses_sha256"]), float(seen["spacing_m"]), float(seen["recall"])
+            )
     except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise InputError(f"{path}: is not a calibration file ({error}); {fix}") from error
     unknown = sorted(set(columns) - set(column_names("signals")))
@@ -98,4 +159,4 @@ def from_toml(path: Path) -> Detector:
     fits = all(vector.shape == (len(columns),) for vector in vectors)
     if not fits or not np.isfinite(numbers).all() or not (vectors[1] > 0).all():
         raise InputError(f"{path}: mean, scale and weight do not fit the columns; {fix}")
-    return Detector(columns, vectors[0], vectors[1], vectors[2], bias, threshold, note)
+    return Detector(columns, vectors[0], vectors[1], vectors[2], bias, threshold, note, fitted_on)

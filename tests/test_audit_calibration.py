@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 
 from taojax.audit import calibration, labels
-from taojax.audit.verdicts import decide
-from taojax.detector import Detector, from_toml, probability, to_toml
+from taojax.detector import (
+    Detector,
+    MapFacts,
+    foreign_map,
+    from_toml,
+    log_odds_terms,
+    probability,
+    to_toml,
+)
 from taojax.errors import InputError
+from taojax.verdicts import decide
 
 
 def frames(rng, n_in, n_out, *, shift=3.0):
@@ -124,7 +132,7 @@ def test_reliability_bins_hold_equal_counts(rng):
     assert (np.diff(bins.promised) > 0).all()
 
 
-def judged(status, tao, *, in_map=True, stale=0.0):
+def judged(status, tao, *, threshold=0.5, stale=0.0):
     n = len(status)
     signals = {
         "frame": np.arange(n),
@@ -132,11 +140,8 @@ def judged(status, tao, *, in_map=True, stale=0.0):
         "tao": np.array(tao),
         "stale": np.full(n, stale),
     }
-    label = np.full(4, "in_map" if in_map else "map_out")
-    split = split_of({"tao": np.array([1.0, 3.0, 1.0, 3.0])}, label)
     one = np.ones(1)
-    threshold = 0.5 if in_map else np.nan
-    return decide(signals, split, Detector(("tao",), 2 * one, one, one, -3.0, threshold, "made up"))
+    return decide(Detector(("tao",), 2 * one, one, one, -3.0, threshold, "made up"), signals)
 
 
 def test_a_frame_at_the_threshold_is_accepted_and_above_it_rejected():
@@ -174,9 +179,40 @@ def test_the_map_alone_sets_the_prior():
 
 
 def test_without_a_threshold_every_frame_is_abstained_on():
-    verdicts = judged(["ok", "ok"], [0.0, 99.0], in_map=False)
+    verdicts = judged(["ok", "ok"], [0.0, 99.0], threshold=np.nan)
     assert verdicts["verdict"].tolist() == ["abstain", "abstain"]
     assert "no in-map frame" in verdicts["reason"][0]
+
+
+def test_terms_are_told_from_the_mean_in_map_frame(rng):
+    signals, label = frames(rng, 60, 40)
+    inside = split_of(signals, label)
+    model = calibration.fit(inside)
+    own = {name: values[inside.is_in] for name, values in inside.signals.items()}
+    np.testing.assert_allclose(log_odds_terms(model, own).mean(axis=0), 0.0, atol=1e-12)
+
+
+SEEN = MapFacts("ab12", 2.0, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("here", "words"),
+    [
+        (SEEN, None),
+        (SEEN._replace(recall=0.895), None),
+        (SEEN._replace(recall=0.4), "other descriptors of this map"),
+        (MapFacts("cd34", 0.5, 0.4), "spacing 2 m and recall 0.90; here spacing 0.5 m and"),
+    ],
+)
+def test_a_calibration_knows_its_map(here, words, rng, tmp_path):
+    path = tmp_path / "calibration.toml"
+    path.write_text(to_toml(calibration.fit(split_of(*frames(rng, 20, 20)), 0.9, SEEN)))
+    said = foreign_map(from_toml(path), here)
+    assert said is None if words is None else words in said
+
+
+def test_a_calibration_that_names_no_map_says_nothing_of_it(rng):
+    assert foreign_map(calibration.fit(split_of(*frames(rng, 20, 20))), SEEN) is None
 
 
 def test_a_calibration_file_gives_the_same_probabilities(rng, tmp_path):
@@ -196,6 +232,7 @@ def test_a_calibration_file_gives_the_same_probabilities(rng, tmp_path):
         lambda t: t.replace('"tao"', '"toa"'),
         lambda t: t.replace("scale = [", "scale = [1.0, "),
         lambda t: t.replace("bias = ", "bias = nan #"),
+        lambda t: t + "[map]\nspacing_m = 1.0\n",
         lambda t: t[:40],
     ],
 )

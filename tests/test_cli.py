@@ -176,8 +176,16 @@ def test_a_bad_config_file_is_exit_3(data_folder, tmp_path, capsys):
         ("audit", "x", "--r-in", "-4"),
     ],
 )
-def test_usage_errors_are_exit_2(words, capsys):
-    fails(capsys, 2, *words)
+def test_usage_errors_are_exit_2(words, data_folder, capsys):
+    fails(capsys, 2, *(str(data_folder) if word == "x" else word for word in words))
+
+
+@pytest.mark.parametrize("verb", ["audit", "score"])
+def test_all_that_a_folder_lacks_is_named_at_once(verb, tmp_path, capsys):
+    line = fails(capsys, 3, verb, str(tmp_path), "--out", str(tmp_path / "run"))
+    wanted = ["map/poses.csv", "query/odometry.csv", "map/descriptors.npy"]
+    assert all(name in line for name in wanted)
+    assert ("truth/query_poses.csv" in line) == (verb == "audit")
 
 
 def test_auditing_without_truth_says_what_to_do(data_folder, tmp_path, capsys):

@@ -221,6 +221,19 @@ def test_without_verdicts_of_its_own_a_run_has_the_judges(scored, tmp_path, caps
     assert names == {"closures.g2o", "rejected.g2o", "trajectory.tum"}
 
 
+def test_every_frame_is_counted_once(run, tmp_path, capsys):
+    assert main(["closures", str(run), "--out", str(tmp_path)]) == 0
+    lines = {line[:14].strip(): line[14:] for line in capsys.readouterr().out.splitlines()}
+    counts = [
+        int(word)
+        for name in ("closures.g2o", "rejected.g2o", "left out")
+        for word in lines[name].replace(",", "").split()
+        if word.isdigit()
+    ]
+    assert len(counts) == 4
+    assert sum(counts) == 50
+
+
 def test_the_detector_is_sealed_with_its_decisions(run, tmp_path, capsys):
     sealed = closures.read_verdicts(run, records.read_run(run))
     assert sealed.source == "decisions.csv"

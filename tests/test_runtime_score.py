@@ -5,7 +5,9 @@ from conftest import table, write_folder
 
 from taojax import records
 from taojax.config import Config, StreamConfig
+from taojax.detector import Detector, MapFacts
 from taojax.runtime.score import score
+from taojax.runtime.watch import load_map
 
 SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
 
@@ -32,6 +34,19 @@ def test_twelve_map_frames_and_unnormalised_descriptors(rng, tmp_path):
     assert (plain.index[:, 12:] == -1).all()
 
 
+def test_a_calibration_of_another_map_is_noted_in_the_seal(rng, tmp_path):
+    folder, one = write_folder(tmp_path / "data", rng), np.ones(1)
+    seen = load_map(folder, SMALL.stream).facts
+    notes = {}
+    for name, facts in (("same", seen), ("foreign", MapFacts("ab12", 2.0, 0.9)), ("old", None)):
+        made_up = Detector(("tao",), one, one, one, 0.0, 0.5, "made up", facts)
+        score(folder, tmp_path / name, SMALL, detector=made_up)
+        notes[name] = records.read_manifest(tmp_path / name)["notes"]
+    assert notes["same"] == notes["old"] == []
+    assert len(notes["foreign"]) == 1
+    assert "fitted on another map (spacing 2 m" in notes["foreign"][0]
+
+
 def test_constant_descriptors_and_a_robot_that_never_moves(rng, tmp_path):
     folder = write_folder(tmp_path / "data", rng)
     for side, n in (("map", 60), ("query", 50)):
@@ -53,8 +68,7 @@ def test_lists_without_any_candidate_have_no_pose(rng, tmp_path):
 
 
 def test_an_acceptance_at_run_time_needs_a_status_of_ok_and_a_fresh_frame(rng, tmp_path):
-    from taojax.detector import Detector
-    from taojax.runtime.score import decide
+    from taojax.verdicts import decide
 
     one = np.ones(1)
     detector = Detector(("tao",), 0 * one, one, one, 0.0, 0.5, "made up")

@@ -105,7 +105,7 @@ def test_lists_of_ones_own_frontend_keep_their_own_scale(folder, tmp_path):
     sealed = records.read_run(folder / "run")
     np.savez(other / "query/retrievals.npz", index=sealed.index, similarity=sealed.similarity)
     score(other, tmp_path / "run", CONFIG)
-    tables, words = load_map(other, CONFIG.stream)
+    tables, words, _ = load_map(other, CONFIG.stream)
     assert "as they are" in words
     out, _ = watched(tables, (folder / "feed.jsonl").read_bytes())
     want = records.read_run(tmp_path / "run").signals["tao"]
@@ -214,12 +214,12 @@ def test_nothing_is_compiled_once_lines_come(tables):
 def test_a_plain_map_folder_will_do(folder, tmp_path):
     for name in ("poses.csv", "descriptors.npy"):
         (tmp_path / name).write_bytes((folder / "data/map" / name).read_bytes())
-    plain, words = load_map(tmp_path, CONFIG.stream)
+    plain, words, _ = load_map(tmp_path, CONFIG.stream)
     assert str(tmp_path / "descriptors.npy") in words
-    want, _ = load_map(folder / "data", CONFIG.stream)
+    want = load_map(folder / "data", CONFIG.stream).tables
     assert float(plain.recall) == float(want.recall)
     (tmp_path / "descriptors.npy").unlink()
-    assert "as they are" in load_map(tmp_path, CONFIG.stream)[1]
+    assert "as they are" in load_map(tmp_path, CONFIG.stream).scale
     np.save(tmp_path / "descriptors.npy", np.ones((7, 3), np.float32))
     with pytest.raises(InputError, match="7 rows"):
         load_map(tmp_path, CONFIG.stream)
@@ -242,6 +242,7 @@ def start(folder):
         )  # fmt: skip
     finally:
         signal.signal(signal.SIGINT, before)
+    assert child.stderr.readline().startswith(b"compiling")
     assert child.stderr.readline().startswith(b"ready: map of 60 places")
     return child
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.audit.labels import CalibrationSplit
-from taojax.detector import LIST_RECALL, Detector, probability
+from taojax.detector import LIST_RECALL, Detector, MapFacts, probability
 
 BLURRED = {
     "top1_w5": 0.45,
@@ -77,7 +77,11 @@ def _note(n_in: int, n_out: int) -> str:
     )
 
 
-def fit(calibration: CalibrationSplit, map_recall: float = LIST_RECALL) -> Detector:
+def fit(
+    calibration: CalibrationSplit,
+    map_recall: float = LIST_RECALL,
+    fitted_on: MapFacts | None = None,
+) -> Detector:
     """Fit the probability of being map-out: logistic, shrunk to a prior made from the map alone.
 
     Location and scale of each signal come from all calibration frames, labelled or not; with one
@@ -86,6 +90,7 @@ def fit(calibration: CalibrationSplit, map_recall: float = LIST_RECALL) -> Detec
     Args:
         calibration: frames that may be fitted on; grey ones give scale but no label.
         map_recall: how far the map tells its own places apart; sealed in the run's manifest.
+        fitted_on: the map, for the day the numbers are used on another one.
 
     Returns:
         The detector. Its threshold is the level that accepts 95 % of the in-map calibration
@@ -115,14 +120,17 @@ def fit(calibration: CalibrationSplit, map_recall: float = LIST_RECALL) -> Detec
         return float(value), np.append(slope, residual.sum() + 0.01 * bias)
 
     best = minimize(loss, np.append(expected, 0.0), jac=True, method="L-BFGS-B").x
+    # Told from the mean in-map frame, a term says what makes a frame unlike the places it knows.
+    level = x[calibration.is_in].mean(axis=0) if calibration.is_in.any() else mean
     detector = Detector(
         columns=tuple(weights),
-        mean=mean,
+        mean=level,
         scale=scale,
         weight=best[:-1],
-        bias=float(best[-1]),
+        bias=float(best[-1] + np.sum((level - mean) / scale * best[:-1])),
         threshold=float("nan"),
         note=_note(int(counts[0]), int(counts[1])),
+        fitted_on=fitted_on,
     )
     inside = probability(detector, calibration.signals)[calibration.is_in]
     return detector._replace(threshold=accepting_level(inside))

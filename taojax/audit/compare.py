@@ -86,13 +86,6 @@ def _audit_json(run: Path, seal: str) -> dict[str, Any]:
     return audit
 
 
-def _is_summary(run: Path) -> bool:
-    try:
-        return "scenarios" in json.loads(read_bytes(run / "manifest.json"))
-    except (ValueError, TypeError):
-        return False
-
-
 def read_judged(run: Path, name: str) -> Judged:
     """Read a sealed run with its labels, probabilities and frozen thresholds.
 
@@ -105,8 +98,6 @@ def read_judged(run: Path, name: str) -> Judged:
     """
     if not run.is_dir():
         raise fail(run, "no such run folder", "name one made by `taojax audit`")
-    if _is_summary(run):
-        raise fail(run, "holds several scenarios", f"name one of them, such as {run}/default")
     sealed = read_run(run)
     audit = _audit_json(run, sealed.manifest["seal"])
     labels = read_table(run / "labels.csv", "labels")

@@ -1,5 +1,6 @@
 """Judge a run in memory: from sealed signals and truth to labels, verdicts and tables."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,10 +10,10 @@ from jaxtyping import Float, Shaped
 from taojax.audit import calibration, labels, metrics, tables
 from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
-from taojax.audit.verdicts import decide
 from taojax.config import Config
-from taojax.detector import Detector
+from taojax.detector import Detector, MapFacts
 from taojax.records import Run, signal_names
+from taojax.verdicts import decide
 
 
 class Judgement(NamedTuple):
@@ -71,6 +72,14 @@ def _outcomes(
     return np.where(label == "grey", "grey", outcome)
 
 
+def _map_of(manifest: Mapping[str, Any]) -> MapFacts | None:
+    """Return which map a run was scored on; None where an older manifest does not say."""
+    poses = manifest["sha256"].get("inputs/map/poses.csv")
+    if poses is None or "map_spacing_m" not in manifest:
+        return None
+    return MapFacts(poses, float(manifest["map_spacing_m"]), float(manifest["map_recall"]))
+
+
 def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     """Judge a sealed run.
 
@@ -91,8 +100,8 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     share, gap = audit.calibration_share, config.stream.window
     first = labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
     recall = float(run.manifest.get("map_recall", calibration.LIST_RECALL))
-    model = calibration.fit(first.calibration, recall)
-    verdicts = decide(run.signals, first.calibration, model)
+    model = calibration.fit(first.calibration, recall, _map_of(run.manifest))
+    verdicts = decide(model, run.signals)
     # Cut again with the probability beside the signals: only the splitter makes the two tables.
     with_fused = signals | {tables.FUSED: verdicts["probability_map_out"]}
     splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)

@@ -10,10 +10,10 @@ import numpy as np
 from taojax.audit import figures, recovery_figures, tables
 from taojax.audit.page import Cell, Grid, Page, grid, render
 from taojax.audit.recovery_data import RECORDED, Judged, Part, Rules, load, recovery_rows
-from taojax.audit.verdicts import plain
 from taojax.config import Config, to_toml
 from taojax.specs import write_atomically
 from taojax.tables import table_text
+from taojax.verdicts import plain
 
 Row = dict[str, Any]
 

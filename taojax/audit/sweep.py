@@ -12,12 +12,12 @@ from taojax.audit import bootstrap, calibration, labels, metrics, tables
 from taojax.audit.figures import as_files
 from taojax.audit.sweep_figures import NO_SETTING, draw, varied
 from taojax.audit.truth import read_truth
-from taojax.audit.verdicts import plain
 from taojax.config import Config
 from taojax.errors import InputError
 from taojax.records import digest_file, read_manifest
 from taojax.specs import column_names, read_npz, write_atomically
 from taojax.tables import read_table, table_text
+from taojax.verdicts import plain
 
 N_TOP = 10
 """Configurations in the printed table."""

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Shaped
 from taojax.audit import bootstrap, calibration, metrics
 from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
-from taojax.audit.verdicts import plain
 from taojax.config import AuditConfig
 from taojax.specs import load_spec
 from taojax.tables import format_number, table_text
+from taojax.verdicts import plain
 
 NAN = float("nan")
 FUSED = "fused"

@@ -17,19 +17,13 @@ from tqdm import tqdm
 from taojax.config import StreamConfig, from_toml
 from taojax.errors import InputError
 from taojax.records import Run
+from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.inside import Inside, joint_inside, rank_inside
 from taojax.runtime.joint import DISTINCT_DELTAS, GAMMA
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.stream import (
-    STATUSES,
-    Frame,
-    StreamRecord,
-    StreamState,
-    cost_params,
-    init,
-    step,
-)
-from taojax.tables import read_table
+from taojax.runtime.score import COMPILING
+from taojax.runtime.stream import StreamState, cost_params, init, step
+from taojax.tables import MOTION, POSE, read_table, stacked
 
 TOLERANCE = 1e-4
 """A replayed `tao` may differ from the sealed one by so much of the larger of 1 and itself: the
@@ -127,7 +121,7 @@ def sealed_tables(folder: Path, run: Run, config: StreamConfig) -> MapTables:
     if lacks:
         what = f"lacks {', '.join(lacks)}, sealed by newer versions"
         raise InputError(f"{folder}: {what}; score the data set again with `taojax score`")
-    poses = np.stack([run.map_poses[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    poses = stacked(run.map_poses, POSE)
     tables = map_tables(poses, config)
     scale, recall = (jnp.asarray(facts[name], jnp.float32) for name in ("map_scale", "map_recall"))
     return eqx.tree_at(lambda t: (t.scale, t.recall), tables, (scale, recall))
@@ -166,9 +160,16 @@ def _replayed(
     record, frame = None, None
     # NumPy cuts a frame out faster than jax does.
     frames = jax.tree.map(np.asarray, frames)
-    for t in tqdm(range(len(frames.odometry)), unit="frame", disable=not progress, leave=False):
-        frame = jax.tree.map(lambda leaf, t=t: jnp.asarray(leaf[t]), frames)
-        before, (after, record) = after, step(config, tables, after, frame)
+    n = len(frames.odometry)
+    with tqdm(total=n, unit="frame", disable=not progress, leave=False, desc=COMPILING) as bar:
+        for t in range(n):
+            frame = jax.tree.map(lambda leaf, t=t: jnp.asarray(leaf[t]), frames)
+            before, (after, record) = after, step(config, tables, after, frame)
+            bar.set_description_str("replaying", refresh=False)
+            if t == 0:
+                # The time of the compiler says nothing of the frames to come.
+                bar.unpause()
+            bar.update()
     if frame is None or record is None:
         raise InputError("nothing to replay; name a frame")
     return before, after, frame, record
@@ -196,7 +197,7 @@ def explain(folder: Path, run: Run, frame: int, *, progress: bool = False) -> Lo
     config = from_toml(folder / "config.toml").stream
     tables = sealed_tables(folder, run, config)
     table = read_table(folder / "odometry.csv", "query_odometry")
-    motion = np.stack([table[c] for c in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
+    motion = stacked(table, MOTION)
     # A folder of trials starts afresh with each.
     length = run.manifest["trial_frames"] or n_frames
     past = slice(frame // length * length, frame + 1)

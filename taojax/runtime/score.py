@@ -12,26 +12,26 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, replace, to_toml
-from taojax.detector import Detector, probability
+from taojax.detector import Detector, MapFacts, foreign_map
 from taojax.detector import to_toml as detector_toml
 from taojax.errors import InputError
 from taojax.records import digest, refuse_if_taken, write_run
+from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
-from taojax.runtime.stream import (
-    STATUSES,
-    Frame,
-    StreamRecord,
-    init,
-    replay,
-)
+from taojax.runtime.stream import init, replay
 from taojax.runtime.trials import in_trials, replay_trials
 from taojax.specs import read_bytes
+from taojax.verdicts import decide
 
 CHUNK_FRAMES = 256
 """Frames per scan; one compilation, and a progress bar that moves."""
+
+
+COMPILING = "compiling once"
+"""On a bar until the first frames are done, some 5 to 20 s: one that stands still alarms."""
 
 
 def candidates(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +64,9 @@ def replay_log(
     n_frames = len(frames.odometry)
     frames = jax.tree.map(np.asarray, frames)
     state, parts = init(config.stream, tables), []
-    with tqdm(total=n_frames, unit="frame", disable=not progress, leave=False) as bar:
+    with tqdm(
+        total=n_frames, unit="frame", disable=not progress, leave=False, desc=COMPILING
+    ) as bar:
         for start in range(0, n_frames, CHUNK_FRAMES):
             n = min(CHUNK_FRAMES, n_frames - start)
             # The last chunk is padded with frames that never were; their records are dropped.
@@ -77,6 +79,7 @@ def replay_log(
             )
             state, records = replay(config.stream, tables, chunk, state)
             parts.append(jax.tree.map(lambda leaf, m=n: np.asarray(leaf)[:m], records))
+            bar.set_description_str("scoring", refresh=False)
             bar.update(n)
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
@@ -122,20 +125,6 @@ def map_facts(tables: MapTables) -> dict[str, Any]:
         "map_scale": [float(end) for end in tables.scale],
         "map_recall": float(tables.recall),
     }
-
-
-def decide(detector: Detector, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns of decisions.csv: run-time verdicts at frozen numbers.
-
-    Args:
-        detector: from a calibration file.
-        table: the columns of signals.csv.
-    """
-    p = probability(detector, table)
-    verdict = np.where(p > detector.threshold, "reject", "accept").astype(object)
-    verdict[(verdict == "accept") & (table["stale"] > 0)] = "abstain"
-    verdict[table["status"] != "ok"] = "abstain"
-    return {"frame": table["frame"], "verdict": verdict, "probability_map_out": p}
 
 
 def score(
@@ -189,6 +178,12 @@ def score(
     # What repeats this run, seen from its own folder; the words typed may name files long gone.
     command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records)
+    notes = list(observations.notes)
+    here = MapFacts(
+        observations.sha256["inputs/map/poses.csv"], float(tables.spacing_m), float(tables.recall)
+    )
+    if detector is not None and (said := foreign_map(detector, here)):
+        notes.append(said)
     return write_run(
         out,
         signals=table,
@@ -202,7 +197,7 @@ def score(
         config_toml=to_toml(config),
         manifest={
             **facts_of(command, dataset, config.seed),
-            "notes": list(observations.notes),
+            "notes": notes,
             **map_facts(tables),
             "trial_frames": n,
             "sha256": observations.sha256,

@@ -19,16 +19,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.config import StreamConfig
-from taojax.detector import Detector
+from taojax.detector import Detector, MapFacts
 from taojax.errors import InputError
+from taojax.records import digest_file
+from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import DESCRIPTORS, descriptor_names
-from taojax.runtime.reasons import STATUS_MEANS, reason
 from taojax.runtime.retrieval import N_KEPT
-from taojax.runtime.score import decide
-from taojax.runtime.stream import STATUSES, Frame, StreamRecord, init, step
+from taojax.runtime.stream import init, step
 from taojax.specs import read_npy
-from taojax.tables import read_table
+from taojax.tables import POSE, read_table, stacked
+from taojax.verdicts import STATUS_MEANS, decide
 
 MOST_BYTES = 1 << 20
 """Longest line; what is longer is skipped up to its end, never held."""
@@ -59,35 +60,44 @@ class Observed(NamedTuple):
     similarity: Float[np.ndarray, " c"]
 
 
-def load_map(folder: Path, config: StreamConfig) -> tuple[MapTables, str]:
+class LoadedMap(NamedTuple):
+    """A map that is ready to be watched."""
+
+    tables: MapTables
+    scale: str
+    """Where its similarity scale comes from, in words."""
+
+    facts: MapFacts
+
+
+def load_map(folder: Path, config: StreamConfig) -> LoadedMap:
     """Prepare the map of a folder, as `taojax score` does for the same folder.
 
     Args:
         folder: a data folder, or one that holds poses.csv and perhaps descriptors.npy.
         config: settings.
 
-    Returns:
-        The map, and in words where its similarity scale comes from.
-
     Raises:
         InputError: no map there, or it does not meet its spec.
     """
     inner = folder / "map" if (folder / "map" / "poses.csv").is_file() else folder
     table = read_table(inner / "poses.csv", "map_poses")
-    poses = np.stack([table[c] for c in ("x_m", "y_m", "theta_rad")], axis=1)
+    poses = stacked(table, POSE)
     path = folder / descriptor_names(folder)[0]
     if inner == folder and path == folder / DESCRIPTORS[0][0]:
         path = folder / "descriptors.npy"
     # Lists of another frontend have a scale of their own, which the map's descriptors do not tell.
-    if (folder / "query/retrievals.npz").is_file() or not path.is_file():
-        return map_tables(poses, config), "similarities are taken as they are (0 to 1)"
-    descriptors = read_npy(path, "descriptors")
-    if len(descriptors) != len(poses):
+    descriptors, scale = None, "similarities are taken as they are (0 to 1)"
+    if path.is_file() and not (folder / "query/retrievals.npz").is_file():
+        descriptors, scale = read_npy(path, "descriptors"), f"similarity scale from {path}"
+    if descriptors is not None and len(descriptors) != len(poses):
         raise InputError(
             f"{path}: {len(descriptors)} rows, but {inner / 'poses.csv'} has {len(poses)}; both "
             "must describe the same frames"
         )
-    return map_tables(poses, config, descriptors), f"similarity scale from {path}"
+    tables = map_tables(poses, config, descriptors)
+    digest = digest_file(inner / "poses.csv")
+    return LoadedMap(tables, scale, MapFacts(digest, float(tables.spacing_m), float(tables.recall)))
 
 
 def _not_json(text: str) -> float:
@@ -224,7 +234,7 @@ class Watch:
             table |= {"frame": np.array([0]), "status": np.array([status], dtype=object)}
             decided = decide(self._detector, table)
             verdict, p = str(decided["verdict"][0]), float(decided["probability_map_out"][0])
-            why = reason(self._detector, row, status, verdict, p)
+            why = str(decided["reason"][0])
         return {
             "frame": self._n_frames,
             "t_s": t_s,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.errors import InputError, UsageError
+from taojax.errors import UsageError
 from taojax.verbs.common import (
     SCENARIOS,
     Common,
@@ -18,6 +18,7 @@ from taojax.verbs.common import (
     say,
     score_apart,
 )
+from taojax.verbs.layout import check_layout
 
 if TYPE_CHECKING:
     from taojax.config import Config
@@ -55,6 +56,8 @@ def run(args: Audit) -> None:
         raise UsageError("--simulate-views completes a DATASET; name one")
     if args.map is not None and not args.simulate_views:
         raise UsageError("--map goes with --simulate-views")
+    if args.dataset is not None and not args.simulate_views:
+        check_layout(args.dataset, has_truth=True)
     config = config_of(args)
     out = out_of(args, "audit", config)
     if args.dataset is not None and args.simulate_views:
@@ -69,9 +72,6 @@ def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool)
     from taojax.records import refuse_if_taken
 
     refuse_if_taken(out)
-    truth = dataset / "truth" / "query_poses.csv"
-    if dataset.is_dir() and not truth.is_file():
-        raise InputError(f"{truth}: no such file; add it, or run `taojax score` without truth")
     score_apart(dataset, out, config, progress=progress)
     _judge(dataset, out, config)
 
@@ -98,9 +98,13 @@ def _audit_converted(
 def _judge(dataset: Path, out: Path, config: "Config") -> None:
     from taojax.audit.evaluate import evaluate
 
+    say("judging: labels, calibration, intervals from resampled blocks, figures")
     evaluation = evaluate(out, dataset / "truth", config)
     print("\n".join(evaluation.sentences))
     say(f"report: {out}/report.html")
+    wrong = (evaluation.judgement.outcome == "accepted_wrong").nonzero()[0]
+    frame = wrong[-1] if wrong.size else len(evaluation.judgement.outcome) - 1
+    say(f"next:   taojax explain {out} --frame {frame}; taojax closures {out}")
 
 
 def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress: bool) -> None:

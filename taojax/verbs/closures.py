@@ -48,12 +48,14 @@ def run(args: Closures) -> None:
         write_atomically(folder / name, text)
     n_map, n_query = len(graph.map_pose), len(graph.query_pose)
     n = {verdict: len(graph.rows(verdict)) for verdict in ("accept", "reject", "abstain")}
-    print(f"verdicts of {verdicts.source}; vertices 0 to {n_map - 1} are the map, "
-          f"{n_map} to {n_map + n_query - 1} the query frames")  # fmt: skip
+    n_frames, n_posed = len(graph.verdict), sum(n.values())
+    print(f"verdicts of {verdicts.source} on {n_frames} frames; vertices 0 to {n_map - 1} are the "
+          f"map, {n_map} to {n_map + n_query - 1} the query frames")  # fmt: skip
     print(f"closures.g2o    {n['accept']} accepted closures")
     print(f"rejected.g2o    {n['reject']} rejected ones, to look at")
+    print(f"left out        {n['abstain']} on which nothing was decided, "
+          f"{n_frames - n_posed} without a pose")  # fmt: skip
     print(f"trajectory.tum  {trajectory.count(chr(10))} accepted poses")
-    print(f"left out        {n['abstain']} poses on which nothing was decided")
     if told := _of_the_audit(args.run):
         print(told)
     say(f"written to {folder}")

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import subprocess
 import sys
 import tempfile
 import time
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from taojax.errors import ConfigError, UsageError
+from taojax.verbs import child
 
 if TYPE_CHECKING:
     from taojax.config import Config
@@ -106,6 +106,6 @@ def score_apart(
         path.write_text(to_toml(config), encoding="utf-8")
         flag = "--progress" if progress else "--no-progress"
         words = ["score", str(dataset), "--out", str(out), "--config", str(path), flag, *flags]
-        done = subprocess.run([sys.executable, "-m", "taojax", *words], check=False)
-    if done.returncode:
-        raise SystemExit(done.returncode)
+        code = child.run(words)
+    if code:
+        raise SystemExit(code)

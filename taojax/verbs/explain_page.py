@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taojax.runtime.reasons import STALE, STATUS_MEANS, signal_terms
+from taojax.detector import log_odds_terms
+from taojax.verdicts import STALE, STATUS_MEANS
 
 if TYPE_CHECKING:
     from taojax.closures import Verdicts
@@ -57,7 +58,8 @@ def headline(look: "Look", verdicts: "Verdicts | None") -> str:
     said = f"frame {look.frame}: {look.status}, tao {look.signals['tao']:.3f}"
     if verdicts is None:
         return said
-    said = f"frame {look.frame}: {verdicts.verdict[look.frame]}, {look.status}"
+    said = f"frame {look.frame}: {verdicts.verdict[look.frame]}"
+    said += "" if look.status == "ok" else f", {look.status}"
     p = verdicts.probability[look.frame]
     if verdicts.detector is None or not np.isfinite(p):
         return said
@@ -98,12 +100,19 @@ def _decided(look: "Look", verdicts: "Verdicts | None") -> str:
     if verdicts is None or verdicts.detector is None:
         return ""
     detector = verdicts.detector
-    terms = signal_terms(detector, look.sealed)
+    terms = _terms(detector, look)
     told = [f"{name} {term:+.2f} (it is {look.sealed[name]:.3g})" for name, term in terms.items()]
     return (
-        f"{', '.join(told)}: log odds of being off the map against a mean calibration frame, "
-        f"beside {detector.bias:+.2f} that every frame gets"
+        f"{', '.join(told)}: log odds of being off the map above the mean in-map frame of the "
+        f"calibration, which itself has {detector.bias:+.2f}"
     )
+
+
+def _terms(detector: "Detector", look: "Look") -> dict[str, float]:
+    """Return what each signal adds to the log odds of the frame, the largest first."""
+    row = {name: np.array([look.sealed[name]]) for name in detector.columns}
+    terms = dict(zip(detector.columns, log_odds_terms(detector, row)[0].tolist(), strict=True))
+    return dict(sorted(terms.items(), key=lambda item: -abs(item[1])))
 
 
 def _tao(look: "Look") -> str:
@@ -237,13 +246,13 @@ def _margin(look: "Look", run: "Run", verdicts: "Verdicts | None") -> str:
 def _excess(look: "Look", detector: "Detector") -> float:
     """Return how far the log odds lie above the threshold's."""
     limit = detector.threshold
-    terms = signal_terms(detector, look.sealed)
+    terms = _terms(detector, look)
     return float(sum(terms.values()) + detector.bias - np.log(limit / (1.0 - limit)))
 
 
 def _lower(look: "Look", run: "Run", detector: "Detector") -> str:
     """Say how far the log odds must fall, and which signal alone could do it."""
-    terms, excess = signal_terms(detector, look.sealed), _excess(look, detector)
+    terms, excess = _terms(detector, look), _excess(look, detector)
     ways = []
     for name in terms:
         at = detector.columns.index(name)

@@ -1,7 +1,6 @@
 """`taojax rerun`: score a sealed run again and hold the new bytes against the seal."""
 
 import dataclasses
-import json
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -96,15 +95,8 @@ def run(args: Rerun) -> None:
 def _read(run: Path) -> "Run":
     """Return a sealed run of `score`; other folders are told by name."""
     from taojax.records import SEALED, read_manifest, read_run
-    from taojax.specs import fail, read_bytes
+    from taojax.specs import fail
 
-    path = run / "manifest.json"
-    try:
-        manifest = json.loads(read_bytes(path))
-    except ValueError:
-        manifest = {}
-    if isinstance(manifest, dict) and "scenarios" in manifest:
-        raise fail(run, "holds several scenarios", f"name one of them, such as {run}/default")
     if not set(SEALED) <= set(read_manifest(run)["sha256"]):
         raise fail(run, "was not made by score", "rerun knows runs of `taojax score` and `audit`")
     return read_run(run)

@@ -9,6 +9,7 @@ import tyro
 
 from taojax.errors import UsageError
 from taojax.verbs.common import Common, Dataset, config_of, flag, out_of, say
+from taojax.verbs.layout import check_layout
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +37,7 @@ def run(args: Score) -> None:
     from taojax.detector import from_toml
     from taojax.runtime.score import score
 
+    check_layout(args.dataset, has_truth=False)
     config = config_of(args)
     out = out_of(args, "score", config)
     rival_logs = args.rival_logs
@@ -52,4 +54,6 @@ def run(args: Score) -> None:
         rival_logs=rival_logs,
         progress=args.progress,
     )
+    for note in manifest["notes"]:
+        say(f"note: {note}")
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")

@@ -37,16 +37,19 @@ class Watch:
 def run(args: Watch) -> None:
     """Watch until stdin ends."""
     from taojax import config as settings
-    from taojax.detector import from_toml
+    from taojax.detector import foreign_map, from_toml
     from taojax.runtime.watch import Watch as Watcher
     from taojax.runtime.watch import load_map
 
     config = (settings.from_toml(args.config) if args.config else settings.Config()).stream
     detector = None if args.calibration is None else from_toml(args.calibration)
-    tables, scale = load_map(args.folder, config)
+    loaded = load_map(args.folder, config)
+    if detector is not None and (said := foreign_map(detector, loaded.facts)):
+        say(f"careful: {said}")
+    say("compiling for some 5 to 20 s")
     start = time.perf_counter()
-    watcher = Watcher(config, tables, detector)
-    say(f"ready: map of {len(tables.grid.xy)} places, {scale}; "
+    watcher = Watcher(config, loaded.tables, detector)
+    say(f"ready: map of {len(loaded.tables.grid.xy)} places, {loaded.scale}; "
         f"compiled in {time.perf_counter() - start:.1f} s")  # fmt: skip
     try:
         watcher.run(sys.stdin.buffer, _write)

@@ -1,0 +1,91 @@
+"""A verb started by a verb ends when its parent does, whatever ended that."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from conftest import write_folder
+
+from taojax.verbs import child
+
+STARTS = """
+import sys
+from taojax.verbs import child
+with child.start(sys.argv[1:]) as started:
+    print(started.pid, flush=True)
+    started.wait()
+"""
+
+RUNS = """
+import sys
+from taojax.verbs import child
+print("ready", flush=True)
+child.HEARD_S = 0.1
+child.run(sys.argv[1:])
+"""
+
+
+def is_alive(pid):
+    """Tell whether a process runs; one that only waits to be reaped does not."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="ascii") as stat:
+            return stat.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.fixture
+def long_job(tmp_path, rng):
+    """Words of a verb that is not done before it is looked at."""
+    data = write_folder(tmp_path / "data", rng, n_query=2000)
+    return ["score", str(data), "--out", str(tmp_path / "run"), "--no-progress"]
+
+
+def begin(code, words):
+    """Start a parent of a verb."""
+    # Tests that run in the background ignore interrupts, and so would what they start.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", code, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGTERM])
+def test_a_child_ends_with_its_killed_parent(long_job, tmp_path, blow):
+    with begin(STARTS, long_job) as parent:
+        pid = int(parent.stdout.readline())
+        time.sleep(0.5)
+        assert is_alive(pid)
+        parent.send_signal(blow)
+        parent.wait()
+        until = time.monotonic() + 20
+        while is_alive(pid) and time.monotonic() < until:
+            time.sleep(0.02)
+        assert not is_alive(pid)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupt_of_the_parent_alone_ends_the_child_too(long_job, tmp_path):
+    with begin(RUNS, long_job) as parent:
+        parent.stdout.readline()
+        time.sleep(0.5)
+        parent.send_signal(signal.SIGINT)
+        # The child holds stderr open as long as it lives.
+        _, said = parent.communicate(timeout=100)
+    assert said.rstrip().endswith("KeyboardInterrupt")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_exit_code_comes_back(capfd):
+    assert child.run(["nonsense"]) == 2
+    assert "nonsense" in capfd.readouterr().err
