@@ -14,7 +14,7 @@ from taojax.datasets.trajectory import integrate
 from taojax.runtime.observations import load_observations
 from taojax.tables import read_table
 
-SETS = ("sthereo", "kri", "mulran", "complex-urban", "robotcar", "vivid", "folder")
+SETS = ("sthereo", "kri", "mulran", "complex-urban", "robotcar", "vivid", "folder", "files")
 FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
 
 
@@ -70,7 +70,7 @@ def test_help_of_every_set_shows_an_example_and_imports_nothing_heavy():
         (["--simulate-views", "--gate-s", "0"], ["--gate-s"]),
         (["--simulate-views", "--least-matched", "50"], ["--least-matched"]),
         (["--simulate-views", "--seed", "-1"], ["--seed"]),
-        (["--simulate-views", "--odometry", "a.txt"], ["--odometry-kind"]),
+        (["--simulate-views", "--odometry", __file__], ["--odometry-kind", "steps"]),
         (["--simulate-views", "--odometry-kind", "tum"], ["--odometry"]),
         (["--simulate-views", "--topic", "/odom"], ["--topic", "--odometry"]),
     ],

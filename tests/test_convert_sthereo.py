@@ -33,7 +33,7 @@ def test_a_pair_of_sequences_becomes_a_data_folder_that_loads(pair, tmp_path, ca
     assert main(["convert", "sthereo", *map(str, pair), str(out), *words]) == 0
     said = capsys.readouterr().err
     assert "58 of 58 frames have a pose within 0.5 s (interpolated)" in said
-    assert f"taojax audit {out}" in said
+    assert f"taojax inspect {out}" in said
 
     t_s = foreign.stamps(58, 1.0, 0.13)
     origin = np.array([[*foreign.pose_at(t_s[0])[:2], 0.0]])

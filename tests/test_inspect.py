@@ -81,7 +81,9 @@ def test_a_healthy_folder_is_told_in_full(healthy, capsys):
         "####",
     ):
         assert words in page
-    assert page.splitlines()[-1].startswith(f"ready for taojax audit {healthy}")
+    *_, ready, _, command = page.splitlines()
+    assert ready.startswith("ready; next")
+    assert command == f"taojax audit {healthy} --r-in 5 --r-out 10"
 
 
 def test_a_folder_without_truth_can_be_scored(folder, capsys):
@@ -89,7 +91,7 @@ def test_a_folder_without_truth_can_be_scored(folder, capsys):
     code, page, _ = report(capsys, folder)
     assert code == 0
     assert "can be scored, not audited" in page
-    assert "ready for taojax score" in page
+    assert page.splitlines()[-1] == f"taojax score {folder}"
     assert "true positions" not in page
 
 
@@ -153,6 +155,17 @@ def test_no_folder_is_exit_3_with_one_line(tmp_path, capsys):
     code, page, errors = report(capsys, tmp_path / "none")
     assert (code, page) == (3, "")
     assert "no such data folder" in errors
+    (tmp_path / "file").touch()
+    code, page, errors = report(capsys, tmp_path / "file")
+    assert (code, page) == (3, "")
+    assert "is a file, no data folder" in errors
+    assert "taojax convert files" in errors
+
+
+def test_a_folder_with_blanks_in_its_name_gives_a_command_to_copy(folder, capsys):
+    spaced = folder.rename(folder.with_name("my data"))
+    page = report(capsys, spaced)[1]
+    assert f"taojax audit '{spaced}' --r-in" in page
 
 
 def test_truth_of_another_clock_is_refused_unless_told(folder, capsys):
@@ -163,7 +176,7 @@ def test_truth_of_another_clock_is_refused_unless_told(folder, capsys):
     assert "0 % lie in its time span" in page
     code, page, _ = report(capsys, folder, "--anyway")
     assert code == 0
-    assert "ready for taojax audit" in page
+    assert page.splitlines()[-1].startswith(f"taojax audit {folder} --r-in")
 
 
 def test_lists_are_described(folder, capsys):
@@ -259,13 +272,22 @@ def test_the_pair_of_files_of_vpr_methods_evaluation_just_works(folder, capsys):
 
 def test_real_recordings_are_ready(shared, capsys):
     for name, words in {
-        "mit_corridor": "59 % of the queries lie farther than 10 m",
-        "tuc_corridor": "every query lies within 10 m",
-        "tuc_corridor_mapout": "122 of 366",
+        "mit_corridor": ("59 % of the queries lie farther than 10 m", "5 --r-out 10"),
+        "intel_lab": ("321 frames are in-map, 121 map-out, 168 between", "1.5 --r-out 3"),
+        "tuc_corridor": ("every query lies within 10 m", "5 --r-out 10"),
+        "tuc_corridor_mapout": ("122 of 366", "5 --r-out 10"),
     }.items():
         code, page, _ = report(capsys, shared / name)
         assert code == 0
-        assert words in page
+        assert words[0] in page
+        assert page.splitlines()[-1] == f"taojax audit {shared / name} --r-in {words[1]}"
+
+
+def test_real_routes_without_the_rest_are_told_how_to_go_on(shared, capsys):
+    code, page, errors = report(capsys, shared / "kaist_routes")
+    assert code == 3
+    assert "OUT --simulate-views" in errors
+    assert "--r-in 10 --r-out 10: a map of 861 m" in page
 
 
 # The measures

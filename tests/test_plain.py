@@ -6,8 +6,10 @@ import scipy.io
 from conftest import table
 from test_descriptors import codes, save
 
+from taojax.datasets.convert import recorded_odometry
 from taojax.datasets.descriptors import read_views
-from taojax.datasets.plain import read_plain, read_traverse
+from taojax.datasets.odometry import read_odometry
+from taojax.datasets.plain import found_in, read_plain, read_traverse
 from taojax.errors import InputError
 
 POSE = "t_s,x_m,y_m,theta_rad"
@@ -231,17 +233,52 @@ def test_bad_poses_are_one_line(tmp_path, kind):
 
 def test_a_traverse_may_have_odometry(tmp_path):
     table(tmp_path / "poses.csv", POSE, drive(4))
-    frames, odometry = read_traverse(tmp_path)
-    assert odometry is None
-    assert len(frames.frames) == 4
+    assert recorded_odometry(tmp_path) is None
+    assert len(read_traverse(tmp_path).frames) == 4
     steps = np.array([[0, 9, 9, 9], [0.5, 1, 0, np.pi / 2], [1, 1, 0, 0]])
     table(tmp_path / "odometry.csv", "t_s,dx_m,dy_m,dtheta_rad", steps)
-    _, odometry = read_traverse(tmp_path)
+    motion = recorded_odometry(tmp_path)
+    assert motion is not None
+    assert (motion.path, motion.kind) == (tmp_path / "odometry.csv", "steps")
+    odometry = read_odometry(motion.path, "steps")
     want = [[0, 0, 0], [1, 0, np.pi / 2], [1, 1, np.pi / 2]]
     np.testing.assert_allclose(odometry.xyt, want, atol=1e-5)
     np.testing.assert_allclose(odometry.t_s, [0, 0.5, 1])
 
 
 def test_a_real_traverse_reads(shared):
-    frames, odometry = read_traverse(shared / "robotcar_vo/2014_07_14_14_49_50")
-    assert len(frames.frames) == len(odometry.t_s) > 100
+    folder = shared / "robotcar_vo/2014_07_14_14_49_50"
+    odometry = read_odometry(folder / "odometry.csv", "steps")
+    assert len(read_traverse(folder).frames) == len(odometry.t_s) > 100
+
+
+# Messages
+
+
+def test_a_folder_of_other_names_says_what_was_looked_for_found_and_helps(tmp_path):
+    for name in ("slam.txt", "feat_map.npy", "img/1.png", "img/2.png", ".hidden"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(InputError) as caught:
+        read_plain(tmp_path)
+    found = "found feat_map.npy, slam.txt, img/1.png, img/2.png"
+    words = ["looked for map/poses.csv", "queries_images_paths.txt", "dbStruct", found,
+             "taojax convert files"]  # fmt: skip
+    assert [word for word in words if word not in str(caught.value)] == []
+    assert "hidden" not in str(caught.value)
+    with pytest.raises(InputError, match=r"no poses\.csv, but feat_map\.npy.*taojax convert files"):
+        read_traverse(tmp_path)
+
+
+def test_a_file_in_the_place_of_a_folder_is_told_of_convert_files(tmp_path):
+    (tmp_path / "slam.txt").write_text("0 0 0 0 0 0 0 1\n")
+    for read in (read_plain, read_traverse):
+        with pytest.raises(InputError, match=r"slam\.txt: is a file, no .*taojax convert files"):
+            read(tmp_path / "slam.txt")
+
+
+def test_many_files_are_counted(tmp_path):
+    for row in range(30):
+        (tmp_path / f"{row:02d}.npy").touch()
+    assert found_in(tmp_path) == "00.npy, 01.npy, 02.npy, 03.npy, 04.npy, 05.npy and 24 more"
+    assert found_in(tmp_path / "..").count(".npy") <= 6

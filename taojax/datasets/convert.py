@@ -8,12 +8,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.datasets.descriptors import read_views, view_notes
+from taojax.datasets.files import NUMBERED, Drive, MotionKind, read_motion
 from taojax.datasets.folder import FAR_M, Descriptors, Lists, Session, write_folder
-from taojax.datasets.odometry import OdometryKind, odometry_at, read_odometry, simulated
+from taojax.datasets.odometry import odometry_at, simulated
 from taojax.datasets.simulate import WorldConfig, describe_routes
 from taojax.datasets.trajectories import Plane
 from taojax.datasets.trajectory import Trajectory, driven_m, every, spaced
 from taojax.errors import InputError
+from taojax.specs import fail
 
 __all__ = [
     "Choices",
@@ -40,8 +42,8 @@ class Motion:
     path: Path
     """File of a trajectory, of steps or of wheel counts."""
 
-    kind: OdometryKind
-    """Its format, as `read_odometry` names it."""
+    kind: MotionKind
+    """Its format, as `read_motion` names it."""
 
     times: Path | None = None
     """Stamps of a format that has none."""
@@ -98,7 +100,7 @@ def recorded_odometry(folder: Path) -> Motion | None:
     Args:
         folder: of a RobotCar traverse, a Complex Urban sequence or a drive of one's own.
     """
-    files: dict[str, OdometryKind] = {
+    files: dict[str, MotionKind] = {
         "vo/vo.csv": "robotcar-vo",
         "odometry.csv": "steps",
         "query/odometry.csv": "steps",
@@ -126,12 +128,13 @@ def recorded_views(folder: Path, mapped: Path | None = None) -> tuple[Path, Path
     return next((pair for pair in pairs if all(p is None or p.is_file() for p in pair)), None)
 
 
-def make_folder(out: Path, sessions: tuple[Session, Session], choices: Choices) -> Made:
+def make_folder(out: Path, given: tuple[Session, Session | None], choices: Choices) -> Made:
     """Write the data folder of a map session and a query session.
 
     Args:
         out: the folder to make; it appears whole or not at all.
-        sessions: map and query, in one frame.
+        given: map and query, in one frame; without a query session its frames are the rows of the
+            odometry, and nobody knows the true poses.
         choices: which frames stay, and where odometry and views come from.
 
     Returns:
@@ -143,6 +146,8 @@ def make_folder(out: Path, sessions: tuple[Session, Session], choices: Choices) 
     """
     if out.exists():
         raise InputError(f"{out}: exists already; choose a new folder")
+    drive = None if choices.motion is None else _read(choices.motion)
+    sessions = given[0], given[1] or _only_driven(drive)
     kept = (
         _chosen(sessions[0], choices.n_map, choices.spacing_m, "map"),
         _chosen(sessions[1], choices.n_query, choices.spacing_m, "query"),
@@ -159,7 +164,7 @@ def make_folder(out: Path, sessions: tuple[Session, Session], choices: Choices) 
         raise InputError(
             f"{out}: nothing can be simulated for a query without poses; give --odometry and views"
         )
-    odometry, moved = _odometry(sessions[1], query, choices)
+    odometry, moved = _odometry(sessions[1], query, choices, drive)
     views, seen = _views(sessions, kept, (mapped, query), choices)
     notes = (*_notes(sessions, kept), *moved, *seen)
     truth = query.xyt if is_known else None
@@ -194,19 +199,46 @@ def _check_one_place(mapped: Trajectory, query: Trajectory) -> None:
             )
 
 
+def _read(motion: Motion) -> Drive:
+    return read_motion(
+        motion.path, motion.kind, times=motion.times, plane=motion.plane, topic=motion.topic
+    )
+
+
+def _only_driven(drive: Drive | None) -> Session:
+    """Return the session of a query of which odometry alone is known."""
+    if drive is None:
+        raise InputError(
+            "the query has neither poses nor odometry; give --query-poses, --odometry or both"
+        )
+    names = tuple(f"{row:06d}" for row in range(len(drive.poses.t_s)))
+    return Session(names, drive.poses, False, drive.notes)
+
+
 def _odometry(
-    session: Session, query: Trajectory, choices: Choices
+    session: Session, query: Trajectory, choices: Choices, drive: Drive | None
 ) -> tuple[Float[np.ndarray, "t 3"], tuple[str, ...]]:
-    if (motion := choices.motion) is None:
+    if (motion := choices.motion) is None or drive is None:
         steps, said = simulated(query.xyt, choices.seed)
         along = "" if session.has_pose else ", along the route progress"
         return steps, (f"{said}{along}",)
-    source = read_odometry(
-        motion.path, motion.kind, times=motion.times, plane=motion.plane, topic=motion.topic
-    )
+    source = _on_the_clock_of(session, drive, motion.path)
     steps, said = odometry_at(source, query.t_s, choices.gate_s)
     named = f"odometry from {motion.path.name} ({motion.kind})"
     return steps, (named,) if said is None else (named, said)
+
+
+def _on_the_clock_of(session: Session, drive: Drive, path: Path) -> Trajectory:
+    """Pair odometry and frames row by row where one of them has no stamps."""
+    n_frames, n_rows = len(session.frames), len(drive.poses.t_s)
+    if drive.has_stamps and NUMBERED not in session.notes:
+        return drive.poses
+    if n_frames == n_rows:
+        return Trajectory(session.poses.t_s, drive.poses.xyt)
+    if path.suffix.lower() == ".npy" and not drive.has_stamps:
+        what = f"{n_rows} rows without stamps, but the query has {n_frames} frames"
+        raise fail(path, what, "store one row per frame, or stamps in a first column")
+    return drive.poses
 
 
 def _views(

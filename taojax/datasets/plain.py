@@ -1,6 +1,8 @@
-"""Folders without a data set of their own: poses beside whatever the user has.
+"""Poses without a data set of their own: single files, or folders that hold them beside the rest.
 
-contract      map/poses.csv with truth/query_poses.csv or query/poses.csv
+files         any names, each given on its own
+contract      the same by default names: map/poses.csv with truth/query_poses.csv, query/poses.csv
+              or query/odometry.csv alone
 image names   database_images_paths.txt, queries_images_paths.txt or the image folders database/
               and queries/; positions in the names, as VPR-methods-evaluation wants them
 dbStruct      one .mat or .db of NetVLAD and seqNet
@@ -16,37 +18,67 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from taojax.datasets.files import DERIVED, NUMBERED, read_poses
 from taojax.datasets.folder import Session
-from taojax.datasets.trajectory import Trajectory, headings, integrate
+from taojax.datasets.trajectories import Plane
+from taojax.datasets.trajectory import Trajectory, headings
 from taojax.errors import InputError
 from taojax.specs import fail, load_spec, read_bytes
 from taojax.tables import read_table
 
-__all__ = ["read_plain", "read_traverse"]
+__all__ = ["found_in", "read_files", "read_plain", "read_traverse"]
 
 SIDES = ("database", "queries")
 IMAGES = (".jpg", ".jpeg", ".png")
+STRUCTS = (".mat", ".db")
+OTHER_NAMES = "rename them, or name every file on its own with `taojax convert files`"
 TIME, ID = 13, 7
 """Fields of an image name, counted in parts between the @."""
 
 LARGEST_M = 1e7
 """No UTM coordinate is larger."""
 
-DERIVED = "headings are derived from positions"
-NUMBERED = "no time stamps: row numbers stand for seconds"
+N_LISTED = 6
+"""Files of a folder that a message names."""
 
 
-def read_plain(folder: Path) -> tuple[Session, Session]:
+def read_files(
+    map_poses: Path, query_poses: Path | None, plane: Plane | None = None
+) -> tuple[Session, Session | None]:
+    """Read map and query sessions from one file of poses each.
+
+    Args:
+        map_poses: any file that `read_poses` takes.
+        query_poses: the same; None where nobody knows the true poses.
+        plane: how 3-D poses are laid flat.
+
+    Returns:
+        Map and query; None for a query that only its odometry knows.
+
+    Raises:
+        InputError: a file is malformed.
+    """
+    query = None if query_poses is None else _posed(query_poses, query_poses.parent, plane)
+    return _posed(map_poses, map_poses.parent, plane), query
+
+
+def read_plain(folder: Path) -> tuple[Session, Session | None]:
     """Read map and query sessions of a plain folder with poses.
 
     Args:
-        folder: of one of the first three kinds above, or a dbStruct file itself.
+        folder: of one of the kinds above but single files and one drive, or a dbStruct itself.
+
+    Returns:
+        Map and query; None for a query that only its odometry knows.
 
     Raises:
         InputError: none or several of the kinds are there, or a file is malformed.
     """
-    if folder.is_file():
+    if folder.is_file() and folder.suffix.lower() in STRUCTS:
         return _db_struct(folder)
+    if folder.is_file():
+        fix = "name the folder, or every file on its own with `taojax convert files`"
+        raise fail(folder, "is a file, no folder", fix)
     if not folder.is_dir():
         raise fail(folder, "no such folder", "point at another one")
     found: list[tuple[str, Any]] = []
@@ -55,63 +87,77 @@ def read_plain(folder: Path) -> tuple[Session, Session]:
     if all(_listed(folder, side) for side in SIDES):
         found.append((f"images of {' and '.join(SIDES)}", _named_images))
     files = sorted(p for p in folder.iterdir() if p.name != "Thumbs.db")
-    structs = [path for path in files if path.suffix in (".mat", ".db")]
+    structs = [path for path in files if path.suffix in STRUCTS]
     found += [(path.name, lambda _, path=path: _db_struct(path)) for path in structs]
-    if len(found) != 1:
-        what = f"holds {' and '.join(name for name, _ in found) or 'no poses'}"
-        fix = "keep one kind, or point at the file" if found else (
-            "expected map/poses.csv, database_images_paths.txt with queries_images_paths.txt, or a"
-            " dbStruct (.mat, .db)"
-        )  # fmt: skip
-        raise fail(folder, what, fix)
+    if len(found) > 1:
+        what = f"holds {' and '.join(name for name, _ in found)}"
+        raise fail(folder, what, "keep one kind, or point at the file")
+    if not found:
+        what = (
+            "holds no poses: looked for map/poses.csv, database_images_paths.txt with"
+            f" queries_images_paths.txt, or a dbStruct (.mat, .db), and found {found_in(folder)}"
+        )
+        raise fail(folder, what, OTHER_NAMES)
     return found[0][1](folder)
 
 
-def read_traverse(folder: Path) -> tuple[Session, Trajectory | None]:
-    """Read one drive.
+def found_in(folder: Path) -> str:
+    """Name some of the files below a folder, for a message."""
+    names, n_more = [], 0
+    for place in (folder, *(p for p in sorted(folder.iterdir()) if p.is_dir())):
+        inside = sorted(p for p in place.iterdir() if p.is_file() and not p.name.startswith("."))
+        names += [path.relative_to(folder).as_posix() for path in inside[:N_LISTED]]
+        n_more += max(0, len(inside) - N_LISTED)
+    n_more += max(0, len(names) - N_LISTED)
+    more = f" and {n_more:,} more" if n_more else ""
+    return f"{', '.join(names[:N_LISTED]) or 'no files'}{more}"
+
+
+def read_traverse(folder: Path) -> Session:
+    """Read the poses of one drive.
 
     Args:
-        folder: holds poses.csv and perhaps odometry.csv, both laid out as in a data folder, the
-            coordinates of any origin.
-
-    Returns:
-        The session, and its odometry chained into poses in the frame of its first stamp; None
-        where there is no odometry.
+        folder: holds poses.csv, laid out as in a data folder, the coordinates of any origin.
 
     Raises:
-        InputError: a file is malformed.
+        InputError: the file is missing or malformed.
     """
-    session = _posed(folder / "poses.csv", folder)
-    path = folder / "odometry.csv"
-    if not path.exists():
-        return session, None
-    table = read_table(path, "query_odometry")
-    steps = np.stack([table[name] for name in ("dx_m", "dy_m", "dtheta_rad")], axis=1)
-    return session, Trajectory(table["t_s"], integrate(steps))
+    path = folder / "poses.csv"
+    if folder.is_file():
+        fix = "name the folder, or every file on its own with `taojax convert files`"
+        raise fail(folder, "is a file, no folder of a drive", fix)
+    if folder.is_dir() and not path.exists():
+        what = f"holds no poses.csv, but {found_in(folder)}"
+        raise fail(folder, what, OTHER_NAMES)
+    return _posed(path, folder)
 
 
-def _contract(folder: Path) -> tuple[Session, Session]:
+def _contract(folder: Path) -> tuple[Session, Session | None]:
     places = [folder / "truth/query_poses.csv", folder / "query/poses.csv"]
     there = [path for path in places if path.exists()]
-    if len(there) != 1:
-        what = "both" if there else "neither of"
-        what = f"holds {what} truth/query_poses.csv and query/poses.csv"
+    mapped = _posed(folder / "map/poses.csv", folder / "map")
+    if len(there) == 1:
+        return mapped, _posed(there[0], folder / "query")
+    if there:
+        what = "holds both truth/query_poses.csv and query/poses.csv"
         raise fail(folder, what, "keep one, with the poses of the queries")
-    return _posed(folder / "map/poses.csv", folder / "map"), _posed(there[0], folder / "query")
+    if not (folder / "query/odometry.csv").exists():
+        what = (
+            "holds map/poses.csv, but neither of truth/query_poses.csv and query/poses.csv, nor"
+            f" query/odometry.csv; found {found_in(folder)}"
+        )
+        raise fail(folder, what, OTHER_NAMES)
+    return mapped, None
 
 
-def _posed(path: Path, side: Path) -> Session:
+def _posed(path: Path, side: Path, plane: Plane | None = None) -> Session:
     """Read poses; the frames are the files in images/ where those are as many."""
-    table = read_table(path, "plain_poses")
-    xy = np.stack([table["x_m"], table["y_m"]], axis=1)
-    theta = table["theta_rad"] if "theta_rad" in table else headings(xy)
-    notes = () if "theta_rad" in table else (f"{path.name}: {DERIVED}",)
+    drive = read_poses(path, plane)
+    n = len(drive.poses.t_s)
     images = _images(side / "images")
-    if len(images) != len(xy):
-        images = [f"{row:06d}" for row in range(len(xy))]
-    return Session(
-        tuple(images), Trajectory(table["t_s"], np.column_stack([xy, theta])), notes=notes
-    )
+    if len(images) != n:
+        images = [f"{row:06d}" for row in range(n)]
+    return Session(tuple(images), drive.poses, notes=drive.notes)
 
 
 def _images(folder: Path) -> list[str]:

@@ -1,6 +1,5 @@
 """Reads all of a data folder but its truth and collects every problem, not only the first."""
 
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,10 +7,11 @@ from typing import TypeVar
 
 import numpy as np
 
+from taojax.about import read_about
 from taojax.errors import InputError
 from taojax.runtime.inspection import Norms, norms
 from taojax.runtime.observations import Observations, descriptor_names, load_observations
-from taojax.specs import fail, read_npy, read_npz, read_text
+from taojax.specs import fail, read_npy, read_npz
 from taojax.tables import read_table
 
 __all__ = ["Found", "check"]
@@ -75,7 +75,8 @@ def check(folder: Path) -> Found:
             _descriptors(found, folder, name, stamps)
     if (folder / "about.toml").exists():
         found.files["about.toml"] = "notes"
-        found.attempt("about.toml", lambda: _parse(folder / "about.toml"))
+        n_query = None if found.query_t is None else len(found.query_t)
+        found.attempt("about.toml", lambda: read_about(folder, n_query))
     try:
         found.observations = load_observations(folder)
     except InputError as error:
@@ -112,13 +113,6 @@ def _descriptors(found: Found, folder: Path, name: str, stamps: np.ndarray | Non
         found.problems[name] = str(fail(folder / name, what, "store one row per frame"))
     measured = found.attempt(name, lambda: norms(array, str(folder / name)))
     found.norms |= {} if measured is None else {name: measured}
-
-
-def _parse(path: Path) -> None:
-    try:
-        tomllib.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise fail(path, f"is not TOML ({error})", "expected notes = [...]") from error
 
 
 def _shape(array: np.ndarray) -> str:

@@ -4,13 +4,15 @@ import dataclasses
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
-from taojax.errors import UsageError
+from taojax.errors import InputError, UsageError
 from taojax.verbs.common import say
 from taojax.verbs.convert_flags import (
     ComplexUrban,
     Convert,
+    Files,
     Folder,
     Kri,
     Mulran,
@@ -22,31 +24,39 @@ from taojax.verbs.convert_flags import (
 
 if TYPE_CHECKING:
     from taojax.datasets.convert import Choices, Motion
+    from taojax.datasets.files import MotionKind
     from taojax.datasets.folder import Session
     from taojax.datasets.sessions import Matching
 
-    Sessions = tuple[Session, Session]
+    Sessions = tuple[Session, Session | None]
 
 __all__ = ["Convert", "make", "run"]
+
+Data = Pair | Folder | Files
 
 
 def run(args: Convert) -> None:
     """Make the data folder and say what comes next."""
     out = args.data.out
     make(args.data)
-    say(f"wrote {out}; next: taojax inspect {out}, then taojax audit {out}")
+    say(f"wrote {out}; next: taojax inspect {quote(str(out))}")
 
 
-def make(data: Pair | Folder) -> None:
+def make(data: Data) -> None:
     """Read the sessions, make the data folder and say what was found.
 
     Args:
         data: the flags of one data set.
     """
+    _check_flags(data)
+    _check_places(data)
+    read = partial(_READ[type(data)], data, _matching(data))
+    # Whether a plain folder is one is asked before what its frames look like.
+    plain = read() if isinstance(data, Folder) else None
     choices = _choices(data)
     from taojax.datasets.convert import make_folder
 
-    sessions = _READ[type(data)](data, _matching(data))
+    sessions = plain or read()
     made = make_folder(data.out, sessions, choices)
     for side, n, way_m in zip(("map", "query"), made.n_frames, made.way_m, strict=True):
         say(f"{side}: {n:,} frames, {way_m:,.0f} m of way")
@@ -54,7 +64,7 @@ def make(data: Pair | Folder) -> None:
         say(f"note: {note}")
 
 
-def _check_flags(data: Pair | Folder) -> None:
+def _check_flags(data: Data) -> None:
     """Refuse flags that contradict each other or ask for nothing."""
     if data.simulate_views and (data.map_views or data.query_views):
         raise UsageError("--simulate-views replaces --map-views and --query-views; drop one")
@@ -70,24 +80,50 @@ def _check_flags(data: Pair | Folder) -> None:
         raise UsageError(f"--least-matched {data.least_matched} is a share from 0 to 1")
     if data.seed < 0:
         raise UsageError(f"--seed {data.seed} must not be negative")
-    for name in ("odometry_kind", "times", "plane", "topic"):
+    own = () if isinstance(data, Files) else ("plane",)
+    for name in ("odometry_kind", "times", "topic", *own):
         if data.odometry is None and getattr(data, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} goes with --odometry")
 
 
-def _motion(data: Pair | Folder) -> "Motion | None":
+def _check_places(data: Data) -> None:
+    """Refuse files and folders that are not given or not there, before questions on the rest."""
+    if isinstance(data, Files) and data.odometry is None and data.query_poses is None:
+        raise UsageError("what is known of the query? Give --odometry, --query-poses or both")
+    flags = ("map", "query", "folder", "map_poses", "query_poses", "odometry", "times",
+             "map_views", "query_views")  # fmt: skip
+    for name in flags:
+        path = getattr(data, name, None)
+        if path is not None and not path.exists():
+            is_flag = name not in ("query", "folder") and not (
+                name == "map" and isinstance(data, Pair)
+            )
+            label = f" (--{name.replace('_', '-')})" if is_flag else ""
+            raise InputError(f"{path}: no such file or folder{label}; point at another one")
+
+
+def _motion(data: Data) -> "Motion | None":
     """Return the odometry that was asked for, else the data set's own, if any."""
     from taojax.datasets.convert import Motion, recorded_odometry
 
     if data.odometry is None:
-        return recorded_odometry(data.folder if isinstance(data, Folder) else data.query)
-    kind = data.odometry_kind or ("bag" if data.odometry.suffix == ".bag" else None)
-    if kind is None:
-        raise UsageError("--odometry needs --odometry-kind: a format is not guessed")
+        own = {Folder: "folder", Files: None}.get(type(data), "query")
+        return None if own is None else recorded_odometry(getattr(data, own))
+    if (kind := data.odometry_kind or _kind_of(data.odometry)) is None:
+        raise UsageError(
+            f"{data.odometry} does not say what it holds; add --odometry-kind: steps (motion from"
+            " frame to frame), poses (where odometry believes to be), or the program that wrote it"
+        )
     return Motion(data.odometry, kind, data.times, data.plane, data.topic)
 
 
-def _views(data: Pair | Folder) -> "tuple[Path, Path | None] | None":
+def _kind_of(path: Path) -> "MotionKind | None":
+    from taojax.datasets.files import kind_of
+
+    return kind_of(path)
+
+
+def _views(data: Data) -> "tuple[Path, Path | None] | None":
     """Return the files of descriptors or lists; None: they are simulated."""
     from taojax.datasets.convert import recorded_views
 
@@ -97,19 +133,26 @@ def _views(data: Pair | Folder) -> "tuple[Path, Path | None] | None":
         return data.map_views, data.query_views
     own = recorded_views(data.folder, data.map) if isinstance(data, Folder) else None
     if own is None:
+        looked = ""
+        if isinstance(data, Folder):
+            looked = f"{data.folder} holds no map/descriptors.npy with query/descriptors.npy,"
+            looked += " database_descriptors.npy with queries_descriptors.npy, or"
+            looked += " query/retrievals.npz; "
+            if data.map is not None:
+                looked = f"{data.map} and {data.folder} hold no descriptors.npy each; "
         raise UsageError(
-            "what do the frames look like? Give --map-views and --query-views, or --simulate-views"
+            f"what do the frames look like? {looked}give --map-views and --query-views, or"
+            " --simulate-views"
         )
     return own
 
 
-def _choices(data: Pair | Folder) -> "Choices":
-    _check_flags(data)
+def _choices(data: Data) -> "Choices":
     views = _views(data)
     from taojax.datasets.convert import N_MAP, N_QUERY, Choices
 
-    # The rows of a plain folder are what its owner chose already.
-    usual = (None, None) if isinstance(data, Folder) else (N_MAP, N_QUERY)
+    # The rows of plain files are what its owner chose already.
+    usual = (N_MAP, N_QUERY) if isinstance(data, Pair) else (None, None)
     return Choices(
         n_map=data.map_frames or usual[0],
         n_query=data.query_frames or usual[1],
@@ -121,7 +164,7 @@ def _choices(data: Pair | Folder) -> "Choices":
     )
 
 
-def _matching(data: Pair | Folder) -> "Matching":
+def _matching(data: Data) -> "Matching":
     from taojax.datasets.sessions import Matching
 
     return Matching(data.gate_s, data.pose == "interpolated", data.least_matched)
@@ -188,9 +231,17 @@ def _folder(data: Folder, matching: "Matching") -> "Sessions":
     if data.map is None:
         mapped, query = read_plain(data.folder)
     else:
-        mapped, query = read_traverse(data.map)[0], read_traverse(data.folder)[0]
-    said = (*query.notes, *read_about(data.folder).notes)
-    return mapped, dataclasses.replace(query, notes=said)
+        mapped, query = read_traverse(data.map), read_traverse(data.folder)
+    notes = read_about(data.folder).notes if data.folder.is_dir() else ()
+    if query is None:
+        return dataclasses.replace(mapped, notes=(*mapped.notes, *notes)), None
+    return mapped, dataclasses.replace(query, notes=(*query.notes, *notes))
+
+
+def _files(data: Files, matching: "Matching") -> "Sessions":
+    from taojax.datasets.plain import read_files
+
+    return read_files(data.map_poses, data.query_poses, data.plane)
 
 
 _READ: dict[type, Callable[[Any, "Matching"], "Sessions"]] = {
@@ -201,4 +252,5 @@ _READ: dict[type, Callable[[Any, "Matching"], "Sessions"]] = {
     Robotcar: _robotcar,
     Vivid: _vivid,
     Folder: _folder,
+    Files: _files,
 }

@@ -8,7 +8,9 @@ import tyro
 
 from taojax.verbs.common import flag
 
-Kind = Literal["tum", "kitti", "euroc", "g2o", "csv", "steps", "wheels", "bag", "robotcar-vo"]
+Kind = Literal[
+    "tum", "kitti", "euroc", "g2o", "csv", "steps", "poses", "wheels", "bag", "robotcar-vo"
+]
 
 
 def _place(metavar: str) -> Any:
@@ -19,10 +21,10 @@ def _place(metavar: str) -> Any:
 class Making:
     """Flags of every data set."""
 
-    map_frames: Annotated[int | None, flag("N", "2000; of a plain folder, all")] = None
+    map_frames: Annotated[int | None, flag("N", "2000; of folder and files, all")] = None
     """Map frames to keep, evenly by number."""
 
-    query_frames: Annotated[int | None, flag("N", "1000; of a plain folder, all")] = None
+    query_frames: Annotated[int | None, flag("N", "1000; of folder and files, all")] = None
     """Query frames to keep, evenly by number."""
 
     spacing_m: Annotated[float | None, flag("M", "by number")] = None
@@ -40,15 +42,16 @@ class Making:
     odometry: Annotated[Path | None, flag("FILE", "the set's own, else simulated")] = None
     """Odometry of the query session."""
 
-    odometry_kind: Annotated[Kind | None, flag("KIND", "bag for a .bag, else to be given")] = None
+    odometry_kind: Annotated[Kind | None, flag("KIND", "as its header or columns say")] = None
     """Its format: tum, kitti, euroc, g2o, csv (stamped poses), steps (as query/odometry.csv),
-    wheels (a Complex Urban folder), bag or robotcar-vo."""
+    wheels (a Complex Urban folder), bag or robotcar-vo. Of an .npy, which cannot say it: steps
+    (forward, left, yaw since the row before) or poses (x, y, theta), with or without stamps."""
 
     times: Annotated[Path | None, flag("FILE", "none")] = None
     """Stamps of odometry without any (kitti)."""
 
     plane: Annotated[Literal["xz", "xy"] | None, flag("xz|xy", "as the kind has it")] = None
-    """Axes of the ground in 3-D odometry: xz for cameras, xy where z is up."""
+    """Axes of the ground in 3-D poses: xz for cameras, xy where z is up."""
 
     topic: Annotated[str | None, flag("NAME", "the only one")] = None
     """Odometry topic of a bag."""
@@ -161,20 +164,39 @@ class Vivid(Pair):
 
 @dataclasses.dataclass(frozen=True)
 class Folder(Making):
-    """A folder of your own with poses; or, with --map, two folders of one drive each.
+    """A folder of your own; or, with --map, two folders of one drive each.
 
     Example: taojax convert folder my_recording OUT --map-views map.npy --query-views query.npy
     """
 
     folder: Annotated[Path, tyro.conf.Positional, _place("FOLDER")]
-    """Folder with map/ and query/ or truth/; with --map, of the query drive: poses.csv and, where
-    it is known, odometry.csv."""
+    """Folder with map/poses.csv and query/poses.csv, truth/query_poses.csv or query/odometry.csv;
+    with --map, of the query drive: poses.csv and, where it is known, odometry.csv."""
 
     out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
     """Data folder to make."""
 
     map: Annotated[Path | None, flag("FOLDER", "FOLDER holds both")] = None
     """Folder of the map drive: poses.csv."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Files(Making):
+    """Single files of any name: .npy, csv, TUM, KITTI, EuRoC or g2o.
+
+    Example: taojax convert files OUT --map-poses places.npy --odometry moves.npy --odometry-kind
+    steps --query-poses slam.txt --map-views a.npy --query-views b.npy
+    """
+
+    out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
+    """Data folder to make."""
+
+    map_poses: Annotated[Path, _place("FILE")]
+    """Poses of the map images: an .npy of (M, 3) x, y, theta or (M, 4) with the stamp first, a csv
+    t_s,x_m,y_m,theta_rad, or what another program wrote."""
+
+    query_poses: Annotated[Path | None, flag("FILE", "nobody knows them: no audit")] = None
+    """True poses of the query images, one each, in the same kinds of files."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +207,7 @@ class Convert:
     """
 
     data: Annotated[
-        Sthereo | Kri | Mulran | ComplexUrban | Robotcar | Vivid | Folder,
+        Sthereo | Kri | Mulran | ComplexUrban | Robotcar | Vivid | Folder | Files,
         tyro.conf.OmitSubcommandPrefixes,
         tyro.conf.OmitArgPrefixes,
     ]

@@ -2,12 +2,14 @@
 
 import dataclasses
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import tyro
 
 from taojax.errors import InputError
 from taojax.verbs.common import Dataset
+from taojax.verbs.layout import TRUTH, advice, check_folder, missing
 
 if TYPE_CHECKING:
     from taojax.audit.truth import Truth
@@ -15,8 +17,6 @@ if TYPE_CHECKING:
 
 LEAST_MATCHED = 0.5
 """Share of query stamps that the truth has to know."""
-
-TRUTH = "truth/query_poses.csv"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,9 @@ class Inspect:
 
 def run(args: Inspect) -> None:
     """Print what was found; refuse a folder that cannot be scored or judged."""
+    check_folder(args.dataset)
     from taojax.runtime.checkup import check
+    from taojax.runtime.radii import suggest_radii
     from taojax.verbs import inspect_page as tell
     from taojax.verbs.inspect_views import lengths, likeness
 
@@ -45,13 +47,21 @@ def run(args: Inspect) -> None:
     tell.files(page, found, has_truth=truth is not None or TRUTH in found.problems)
     matched = tell.clocks(page, found, truth)
     shape = tell.drive(page, found)
-    tell.odometry(page, found, truth, shape)
+    drift_m = tell.odometry(page, found, truth, shape)
     lengths(page, found)
+    command = f"taojax score {quote(str(args.dataset))}"
     if shape is not None:
-        likeness(page, found, truth, shape)
-    refusal = _refusal(found, None if args.anyway else matched)
-    verb = "score" if truth is None else "audit"
-    page.end(f"refused: {refusal}" if refusal else f"ready for taojax {verb} {args.dataset}")
+        radii = suggest_radii(shape, drift_m)
+        nearest_m = likeness(page, found, truth, shape, radii)
+        if truth is not None:
+            command = (
+                f"taojax audit {quote(str(args.dataset))} {tell.radii(page, radii, nearest_m)}"
+            )
+    refusal = _refusal(args.dataset, found, None if args.anyway else matched)
+    if refusal:
+        page.end(f"refused: {refusal}")
+    else:
+        page.end("ready; next", command)
     print("\n".join(page.lines))
     if refusal:
         raise InputError(f"{args.dataset}: {refusal}")
@@ -80,11 +90,12 @@ def _n_rows(path: Path) -> int:
     return len(read_text(path).rstrip().splitlines()) - 1
 
 
-def _refusal(found: "Found", matched: float | None) -> str:
+def _refusal(folder: Path, found: "Found", matched: float | None) -> str:
     """Return why the folder is refused, blank where it is not."""
     if found.problems:
         names = ", ".join(found.problems)
-        return f"{len(found.problems)} problem(s): {names}; mend them and inspect again"
+        fix = advice(folder) if missing(folder) else "mend them and inspect again"
+        return f"{len(found.problems)} problem(s): {names}; {fix}"
     if matched is not None and matched < LEAST_MATCHED:
         return (
             f"the truth knows {100 * matched:.0f} % of the query stamps; give both files one clock,"

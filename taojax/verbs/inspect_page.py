@@ -6,11 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taojax.runtime.inspection import clock, map_shape, matched_share, step_m, steps
+from taojax.runtime.radii import SITES, Radii, drift_m
 
 if TYPE_CHECKING:
     from taojax.audit.truth import Truth
     from taojax.runtime.checkup import Found
     from taojax.runtime.inspection import Clock, MapShape
+
+WINDOW = 20
+"""Frames over which the drift of odometry is told: the default window."""
 
 UNITS = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
@@ -42,14 +46,17 @@ class Page:
         if is_so:
             self.warnings.append(text)
 
-    def end(self, verdict: str) -> None:
-        """Add the warnings and the verdict."""
+    def end(self, verdict: str, command: str = "") -> None:
+        """Add the warnings, the verdict and a command to copy."""
         self.head("warnings")
         for text in self.warnings:
             self.add(f"  - {text}")
         n = len(self.warnings)
         count = f" ({n} warning{'s' if n > 1 else ''})" if n else ""
         self.lines += ["", f"{verdict}{count}"]
+        if command:
+            self.lines[-1] += ":"
+            self.lines += ["", command]
 
 
 def files(page: Page, found: "Found", *, has_truth: bool) -> None:
@@ -141,14 +148,23 @@ def drive(page: Page, found: "Found") -> "MapShape | None":
     return shape
 
 
-def odometry(page: Page, found: "Found", truth: "Truth | None", shape: "MapShape | None") -> None:
-    """Describe the robot's motion and hold it against the truth, else against the map."""
+def odometry(
+    page: Page, found: "Found", truth: "Truth | None", shape: "MapShape | None"
+) -> float | None:
+    """Describe the robot's motion and hold it against the truth, else against the map.
+
+    Returns:
+        How far it strays from the truth over a window [m], where that is known.
+    """
     if found.odometry is None:
-        return
+        return None
     is_known = truth is not None and len(truth.t_s) == len(found.odometry)
     moved = steps(found.odometry, truth.xy_m if truth is not None and is_known else None)
     page.head("odometry")
     other, scale, what = "", moved.scale, "the truth"
+    drift = None
+    if truth is not None and is_known:
+        drift = drift_m(found.odometry, truth.xy_m, WINDOW)
     if truth is not None and scale is not None:
         other = f", truth {step_m(truth.xy_m).sum():,.0f} m; {scale:.2f} of the truth (median step)"
     elif shape is not None and shape.way_m > 0:
@@ -157,6 +173,8 @@ def odometry(page: Page, found: "Found", truth: "Truth | None", shape: "MapShape
     page.say("way driven", f"{moved.way_m:,.0f} m{other}")
     largest = f"{moved.largest_m:.2f} m into row {moved.largest_row + 2}"
     page.say("steps", f"{moved.median_m:.2f} m median, the longest {largest}")
+    if drift is not None:
+        page.say("drift", f"{drift:.2g} m from the truth over {WINDOW} frames (median)")
     page.warn(
         scale is not None and not 1 / 3 <= scale <= 3,
         f"odometry is {scale or 0:.3g} times {what}: are its rows metres from frame to frame?",
@@ -171,3 +189,28 @@ def odometry(page: Page, found: "Found", truth: "Truth | None", shape: "MapShape
         moved.largest_yaw_rad > 1.01 * np.pi,
         f"a frame turns by {moved.largest_yaw_rad:.0f} rad: is dtheta_rad in degrees?",
     )
+    return drift
+
+
+def radii(page: Page, proposed: Radii, nearest_m: "np.ndarray | None") -> str:
+    """Propose radii and say what they make of the frames; return them as flags."""
+    rooms, hall, street = (f"{site.r_in_m:g}/{site.r_out_m:g}" for site in SITES)
+    flags = f"--r-in {proposed.r_in_m:g} --r-out {proposed.r_out_m:g}"
+    page.head("radii")
+    page.say("suggested", f"{flags}: {proposed.why}")
+    page.say(
+        "the rule",
+        f"by the longer side of the map: {rooms} below {SITES[0].below_m:g} m,"
+        f" {hall} below {SITES[1].below_m:g} m, else {street}",
+    )
+    if nearest_m is None:
+        return flags
+    n_in, n_out = (
+        int((nearest_m <= proposed.r_in_m).sum()),
+        int((nearest_m > proposed.r_out_m).sum()),
+    )
+    grey = (
+        f", {len(nearest_m) - n_in - n_out:,} between" if proposed.r_out_m > proposed.r_in_m else ""
+    )
+    page.say("with these", f"{n_in:,} frames are in-map, {n_out:,} map-out{grey}")
+    return flags

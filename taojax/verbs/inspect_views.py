@@ -11,10 +11,8 @@ if TYPE_CHECKING:
     from taojax.audit.truth import Truth
     from taojax.runtime.checkup import Found
     from taojax.runtime.inspection import MapShape, Norms
-    from taojax.runtime.likeness import Views
-
-REACH_M = 10.0
-"""The default radii of `audit`."""
+    from taojax.runtime.likeness import Places, Views
+    from taojax.runtime.radii import Radii
 
 BARELY, CLEAR = 0.04, 0.7
 """A recall so little above chance says that rows are mixed up; one above the other is good."""
@@ -62,10 +60,16 @@ def _norms(page: Page, name: str, of: "Norms") -> None:
         page.warn(True, f"{where}; they resemble nothing")
 
 
-def likeness(page: Page, found: "Found", truth: "Truth | None", shape: "MapShape") -> None:
-    """Say how far the frontend tells places apart and, with truth, how often it is right."""
+def likeness(
+    page: Page, found: "Found", truth: "Truth | None", shape: "MapShape", radii: "Radii"
+) -> np.ndarray | None:
+    """Say how far the frontend tells places apart and, with truth, how often it is right.
+
+    Returns:
+        (T,) metres from every query to the nearest map pose, where they are known.
+    """
     if found.observations is None:
-        return
+        return None
     xy, reach_m = found.observations.map_xyt[:, :2], near_m(shape.spacing_m)
     seen, blind = views(found.observations, xy, shape.spacing_m), chance(xy, reach_m)
     near = f"within {reach_m:.3g} m (9 spacings)"
@@ -82,43 +86,48 @@ def likeness(page: Page, found: "Found", truth: "Truth | None", shape: "MapShape
             f"descriptors tell apart only {share(recall)} of the map's own places:"
             " expect abstentions",
         )
+    nearest_m = None
     if truth is not None and len(truth.t_s) == len(found.observations.t_s):
-        _places(page, seen, xy, truth.xy_m, reach_m)
+        where = places(seen, xy, truth.xy_m, reach_m)
+        nearest_m = where.nearest_m
+        _best_matches(page, where)
+        _distances(page, nearest_m, radii)
     _similarities(page, seen)
+    return nearest_m
 
 
-def _places(
-    page: Page, seen: "Views", map_xy: np.ndarray, true_xy: np.ndarray, reach_m: float
-) -> None:
-    where = places(seen, map_xy, true_xy, reach_m)
-    nearest = where.nearest_m
+def _best_matches(page: Page, where: "Places") -> None:
     if np.isfinite(where.right):
         page.say(
             "best match",
-            f"{share(where.right)} lie within {reach_m:.3g} m of the true position where the map"
-            f" has an image there; by chance {share(where.chance)}",
+            f"{share(where.right)} lie within {where.near_m:.3g} m of the true position where the"
+            f" map has an image there; by chance {share(where.chance)}",
         )
         page.warn(
             where.right <= where.chance + BARELY,
             "best matches are hardly more often right than by chance: do the rows of the query's"
             " descriptors follow query/odometry.csv?",
         )
+
+
+def _distances(page: Page, nearest: np.ndarray, radii: "Radii") -> None:
     page.head("true positions")
     page.say(
         "nearest map pose",
         f"{np.median(nearest):.1f} m median, {np.quantile(nearest, 0.95):.1f} m at 95 %, at most"
         f" {nearest.max():.1f} m",
     )
-    out = float(np.mean(nearest > REACH_M))
-    page.say("off the map", f"{share(out)} of the queries lie farther than {REACH_M:g} m from it")
+    out_m = radii.r_out_m
+    out = float(np.mean(nearest > out_m))
+    page.say("off the map", f"{share(out)} of the queries lie farther than {out_m:g} m from it")
     page.warn(
         out == 0,
-        f"every query lies within {REACH_M:g} m of the map: with the default radii nothing is"
-        " map-out and AUROC is not defined; choose --r-in and --r-out, or cut the map",
+        f"every query lies within {out_m:g} m of the map: nothing is map-out and AUROC is not"
+        " defined; choose a smaller --r-out, or cut the map",
     )
     page.warn(
         out == 1,
-        f"no query lies within {REACH_M:g} m of the map: are map and truth in one frame?",
+        f"no query lies within {out_m:g} m of the map: are map and truth in one frame?",
     )
 
 
