@@ -10,10 +10,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from matplotlib.axes import Axes
+from matplotlib.transforms import offset_copy
 
 IN_MAP, MAP_OUT, INK, PALE = "#0072B2", "#D55E00", "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), "-")
+
+LEAST_SIDE = 0.22
+"""The shorter side of a drawn map, of its longer one: a corridor keeps room for its marks."""
+
+MAP_MARGIN = 0.04
+"""Room around a map, of its longer side."""
+
+BELOW_MAP_IN = 1.75
+"""Room for labels and four rows of legend below a map, inches."""
 
 
 class Mark(NamedTuple):
@@ -26,8 +36,8 @@ class Mark(NamedTuple):
 
 
 OUTCOMES = {
-    "abstained": Mark("abstained", PALE, "|", 22),
-    "grey": Mark("grey zone, not judged", "#c9c9c9", "_", 22),
+    "abstained": Mark("abstained", "#555555", "|", 26),
+    "grey": Mark("grey zone, not judged", "#8f8f8f", "_", 26),
     "rejected_out": Mark("rejected, truly off the map", "#56B4E9", "^", 13),
     "accepted_in": Mark("accepted, right place", IN_MAP, "o", 12),
     "rejected_in": Mark("rejected though in the map", "#CC79A7", "s", 14),
@@ -107,6 +117,34 @@ def signal_trace(
     return ax
 
 
+def _map_limits(*groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners around all finite points; neither side is less than a share of the other."""
+    points = np.concatenate(groups)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.zeros(2), np.ones(2)
+    low, high = points.min(axis=0), points.max(axis=0)
+    longest = max(float((high - low).max()), 1.0)
+    side = np.maximum(high - low, LEAST_SIDE * longest) + 2 * MAP_MARGIN * longest
+    return 0.5 * (low + high) - 0.5 * side, 0.5 * (low + high) + 0.5 * side
+
+
+def map_size(
+    *groups: Float[np.ndarray, "_ 2"], wide_in: float = 7.2, most_in: float = 6.2
+) -> tuple[float, float]:
+    """Return the size of a figure that a map fills, inches.
+
+    Args:
+        groups: positions to be drawn, metres.
+        wide_in: its width.
+        most_in: height of the axes at most; tall maps are narrower.
+    """
+    low, high = _map_limits(*groups)
+    across, up = high - low
+    inside = min(most_in, (wide_in - 1.0) * float(up / across))
+    return wide_in, inside + BELOW_MAP_IN
+
+
 def verdict_map(
     map_m: Float[np.ndarray, "m 2"],
     query_m: Float[np.ndarray, "t 2"],
@@ -137,9 +175,15 @@ def verdict_map(
                 *here.T, s=mark.size, color=mark.colour, marker=mark.marker, linewidths=0.7,
                 label=f"{mark.label} ({len(here)})", zorder=3 + order,
             )  # fmt: skip
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    ax.set_adjustable("datalim")
-    ax.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncol=2)
+    low, high = _map_limits(map_m, query_m, matched_m[wrong])
+    ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    ax.set_aspect("equal", adjustable="box", anchor="N")
+    # In points below the axes: a share of their height would write over the label of a flat map.
+    below = offset_copy(ax.transAxes, fig=ax.get_figure(root=True), y=-34, units="points")
+    ax.legend(
+        frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncol=2,
+        bbox_transform=below,
+    )  # fmt: skip
     return ax
 
 
@@ -158,12 +202,13 @@ def curves(
         x: label of the x axis.
         y: label of the y axis.
         ax: where to draw.
-        strong: names whose lines are thicker.
+        strong: names whose lines are thicker, and unbroken but for the second of them.
     """
+    ours = dict(zip(strong, ("-", (0, (4, 1.2))), strict=False))
     for number, (name, (right, up)) in enumerate(lines.items()):
         ax.plot(
-            right, up, color=CYCLE[number], linestyle=STYLES[number], label=name,
-            linewidth=2.4 if name in strong else 1.3,
+            right, up, color=CYCLE[number], linestyle=ours.get(name, STYLES[number % len(STYLES)]),
+            label=name, linewidth=2.4 if name in ours else 1.3,
         )  # fmt: skip
     ax.set(xlabel=x, ylabel=y, xlim=(-0.01, 1.01), ylim=(-0.01, 1.01))
     ax.grid(alpha=0.25)

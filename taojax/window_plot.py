@@ -1,5 +1,6 @@
 """The picture of one frame: its window on the map, and what disagrees."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,17 @@ from taojax.plots import CYCLE, IN_MAP, INK, MAP_OUT, PALE
 MARGIN = 0.15
 """Room around what is drawn, of its larger side."""
 
-LABELS = ((8, 6), (-8, 6), (8, -13), (-8, -13), (8, 18))
-"""Where the label of a branch stands, points: neighbours do not write over each other."""
+ARROW = 0.07
+"""Length of an arrow, of the side of its panel."""
+
+AXES_POINTS = 340.0
+"""Side of a panel, points; labels are placed before anything is laid out."""
+
+LETTER, LINE = 5.2, 10.0
+"""Width of a letter and height of a line of a label, points."""
+
+REACH = (13.0, 20.0, 30.0, 42.0, 56.0)
+"""How far from its branch the middle of a label may stand, points."""
 
 CANDIDATE, BRANCH = CYCLE[4], CYCLE[2]
 
@@ -55,6 +65,64 @@ def _limits(*groups: np.ndarray) -> tuple[tuple[float, float], tuple[float, floa
     return (x - half, x + half), (y - half, y + half)
 
 
+def _hits(box: np.ndarray, points: Float[np.ndarray, "p 2"]) -> int:
+    """Count the points inside a box of (left, low, right, high)."""
+    return int(np.sum(np.all((points > box[:2]) & (points < box[2:]), axis=1)))
+
+
+def place_labels(
+    at: Float[np.ndarray, "k 2"], texts: Sequence[str], busy: Float[np.ndarray, "p 2"]
+) -> Float[np.ndarray, "k 2"]:
+    """Find a middle for each label that hides neither another label nor what is drawn.
+
+    Args:
+        at: what is labelled, points.
+        texts: one line each.
+        busy: where something is drawn, points.
+
+    Returns:
+        Offsets from `at`, points; the nearest of the best.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.4
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ways = np.concatenate([reach * ring for reach in REACH])
+    boxes: list[np.ndarray] = []
+    found = np.zeros((len(texts), 2))
+    for number, (spot, text) in enumerate(zip(at, texts, strict=True)):
+        half = 0.5 * np.array([LETTER * len(text) + 4.0, LINE + 2.0])
+        costs = []
+        for way in ways:
+            box = np.concatenate([spot + way - half, spot + way + half])
+            shared = [np.minimum(box[2:], o[2:]) - np.maximum(box[:2], o[:2]) for o in boxes]
+            overlap = sum(float(np.prod(np.maximum(side, 0.0))) for side in shared)
+            off = np.sum(np.maximum(-box[:2], 0.0) + np.maximum(box[2:] - AXES_POINTS, 0.0))
+            costs.append(overlap + 6.0 * _hits(box, busy) + 20.0 * float(off) + np.hypot(*way) / 4)
+        found[number] = ways[int(np.argmin(costs))]
+        middle = spot + found[number]
+        boxes.append(np.concatenate([middle - half, middle + half]))
+    return found
+
+
+def _label_branches(marks: WindowMarks, corner: np.ndarray, side_m: float, ax: Axes) -> None:
+    """Number the branches and write their costs."""
+    points = lambda xy: (xy - corner) * AXES_POINTS / side_m
+    pose, cost = marks.branch, marks.branch_cost
+    ahead = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
+    steps = ARROW * side_m * np.linspace(0.0, 1.1, 7)
+    arrows = (pose[:, None, :2] + steps[None, :, None] * ahead[:, None]).reshape(-1, 2)
+    drawn = (marks.map_m, marks.candidate_m, marks.path_m, arrows, arrows, pose[:, :2])
+    busy = points(np.concatenate([part for part in drawn if len(part)]))
+    texts = [f"{number}: {value:.2f}" for number, value in enumerate(cost, start=1)]
+    offsets = place_labels(points(pose[:, :2]), texts, busy)
+    for spot, text, offset in zip(pose[:, :2], texts, offsets, strict=True):
+        ax.annotate(
+            text, spot, xytext=offset, textcoords="offset points", fontsize=8, color=INK,
+            ha="center", va="center", zorder=9,
+            arrowprops={"arrowstyle": "-", "color": PALE, "linewidth": 0.6, "shrinkA": 0,
+                        "shrinkB": 4},
+        )  # fmt: skip
+
+
 def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
     """Draw a window on the map.
 
@@ -72,10 +140,13 @@ def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
         )  # fmt: skip
     ax.plot(*path.T, color=INK, linewidth=0.9, zorder=4, label="odometry on the best branch")
     if is_close:
+        label = "from a frame to the map pose it is paired with"
         for at, to, good in zip(path, marks.anchor_m, agrees, strict=True):
             if np.isfinite(to).all():
                 colour, style = (IN_MAP, "-") if good else (PALE, ":")
-                ax.plot(*np.stack([at, to], axis=1), color=colour, linewidth=0.8, linestyle=style)
+                ends = np.stack([at, to], axis=1)
+                ax.plot(*ends, color=colour, linewidth=0.8, linestyle=style, label=label)
+                label = None
     for chosen, colour, marker, size, name in (
         (agrees, IN_MAP, "o", 15, "frames that agree"),
         (~agrees, MAP_OUT, "x", 26, "frames that disagree"),
@@ -89,20 +160,17 @@ def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
         if is_close
         else _limits(marks.map_m, path, marks.branch[:, :2])
     )
-    for number, (pose, cost) in enumerate(zip(marks.branch, marks.branch_cost, strict=True)):
+    for number, pose in enumerate(marks.branch):
         if is_close and number:
             break
-        label = "robot on each branch, numbered by cost" if number == 0 and not is_close else None
+        label = (
+            "robot on each branch, with number and cost" if number == 0 and not is_close else None
+        )
         ax.scatter(*pose[:2], s=34, color=BRANCH, marker="D", edgecolors="white", linewidths=0.6,
                    label=label, zorder=8)  # fmt: skip
-        _arrow(ax, pose, 0.07 * (right - left), BRANCH)
-        if not is_close:
-            right_of, up = LABELS[number % len(LABELS)]
-            ax.annotate(
-                f"{number + 1}: {cost:.2f}", pose[:2], xytext=(right_of, up), fontsize=8,
-                ha="left" if right_of > 0 else "right", textcoords="offset points", color=INK,
-                zorder=9,
-            )  # fmt: skip
+        _arrow(ax, pose, ARROW * (right - left), BRANCH)
+    if not is_close:
+        _label_branches(marks, np.array([left, low]), right - left, ax)
     ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(left, right), ylim=(low, high))
     ax.set_aspect("equal", adjustable="box")
     return ax

@@ -1,8 +1,11 @@
 """A made-up robot whose truth is known, sealed like a real run, for the tests of the judge."""
 
 import numpy as np
+import pytest
 
 from taojax import records
+from taojax.audit import figures
+from taojax.audit.evaluate import evaluate
 from taojax.config import AuditConfig, Config, StreamConfig, to_toml
 
 N_CANDIDATES = 100
@@ -61,3 +64,12 @@ def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulat
     text = "\n".join(["t_s,x_m,y_m,theta_rad", *rows]) + "\n"
     (folder / "truth" / "query_poses.csv").write_text(text)
     return run, folder / "truth"
+
+
+def evaluated(folder, **changes):
+    """Seal a run and judge it; return (run folder, evaluation)."""
+    run, truth = seal(folder, **changes)
+    with pytest.MonkeyPatch.context() as patch:
+        # Pictures take most of the time; one is enough for the page.
+        patch.setattr(figures, "draw", lambda judgement: (figures.retrieval(judgement),))
+        return run, evaluate(run, truth, config())

@@ -18,7 +18,8 @@ from taojax.tables import read_table
 FILES = {
     "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "calibration.toml", "report.html",
     "tables/main.md", "tables/main.tex",
-    *(f"tables/{n}.{e}" for n in ("metrics", "recall", "micro", "errors", "conformal")
+    *(f"tables/{n}.{e}"
+      for n in ("metrics", "recall", "micro", "errors", "conformal", "counts", "rates")
       for e in ("csv", "md", "tex")),
     *(f"figures/{n}.{e}"
       for n in ("map", "diagnostics", "roc", "pr", "reliability", "retrieval", "micro")

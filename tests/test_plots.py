@@ -6,6 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from taojax import plots
+from taojax.window_plot import AXES_POINTS, LETTER, LINE, place_labels
 
 
 @pytest.fixture
@@ -54,6 +55,53 @@ def test_map_axes_are_metres_at_equal_scale(ax):
     DRAWN["map"](ax)
     assert ax.get_xlabel() == "x [m]"
     assert ax.get_aspect() == 1.0
+
+
+@pytest.mark.parametrize(
+    ("extent", "most"), [((500.0, 0.0), 3.5), ((500.0, 500.0), 8.0), ((0.0, 500.0), 8.0)]
+)
+def test_a_map_gets_a_figure_of_its_own_shape_and_keeps_all_of_it(extent, most, ax):
+    points = np.stack([np.linspace(0, side, 50) for side in extent], axis=1)
+    wide, high = plots.map_size(points)
+    assert wide == 7.2
+    assert 2.5 < high <= most
+    plots.verdict_map(points, points, points, np.full(50, "accepted_in"), ax=ax)
+    for side, limits in zip(extent, (ax.get_xlim(), ax.get_ylim()), strict=True):
+        assert limits[0] < 0.0
+        assert limits[1] > side
+    # Nothing is a thread: the shorter side is a fair share of the longer one.
+    spans = sorted(np.ptp(limits) for limits in (ax.get_xlim(), ax.get_ylim()))
+    assert spans[0] > 0.2 * spans[1]
+
+
+def test_the_legend_of_a_flat_map_stays_inside_the_figure():
+    points = np.stack([np.linspace(0, 500, 7), np.zeros(7)], axis=1)
+    figure = Figure(figsize=plots.map_size(points), layout="constrained")
+    kinds = np.array([*plots.OUTCOMES, "accepted_in"])
+    ax = plots.verdict_map(points, points, points, kinds, ax=figure.subplots())
+    figure.draw_without_rendering()
+    box = ax.get_legend().get_window_extent()
+    label = ax.xaxis.label.get_window_extent()
+    assert box.y0 >= 0.0
+    assert box.y1 <= label.y0
+
+
+def test_labels_hide_neither_one_another_nor_what_they_name():
+    at = np.full((5, 2), 0.5 * AXES_POINTS) + np.array([[3.0 * i, 2.0 * i] for i in range(5)])
+    texts = [f"{i + 1}: 0.9{i}" for i in range(5)]
+    middle = at + place_labels(at, texts, at)
+    half = 0.5 * np.array([LETTER * len(texts[0]), LINE])
+    for i, one in enumerate(middle):
+        assert not any(np.all(np.abs(one - spot) < half) for spot in at)
+        for other in middle[:i]:
+            assert not np.all(np.abs(one - other) < 2.0 * half)
+
+
+def test_labels_at_the_edge_stay_in_the_panel():
+    at = np.array([[2.0, 2.0], [AXES_POINTS - 2.0, AXES_POINTS - 2.0]])
+    middle = at + place_labels(at, ["1: 0.10", "2: 0.20"], at)
+    assert np.all(middle > 0.5 * LINE)
+    assert np.all(middle < AXES_POINTS - 0.5 * LINE)
 
 
 def test_map_out_frames_are_shaded_and_the_threshold_is_drawn(ax):

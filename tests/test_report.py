@@ -12,18 +12,14 @@ import pytest
 from taojax import records
 from taojax.audit import figures, route
 from taojax.audit.evaluate import evaluate
-from taojax.audit.glossary import glossary, marked
+from taojax.audit.glossary import glossary, marked, names_of_signals
 from taojax.audit.page import Page, render
-from taojax.audit.words import find_words, lead_words
+from taojax.audit.words import NO_SHIELD, TOO_SHORT, UNKNOWN, find_words, lead_words, span, warnings
 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    run, truth = judged.seal(tmp_path_factory.mktemp("case"))
-    with pytest.MonkeyPatch.context() as patch:
-        # Pictures take most of the time; one is enough for the page.
-        patch.setattr(figures, "draw", lambda judgement: (figures.retrieval(judgement),))
-        return run, evaluate(run, truth, judged.config())
+    return judged.evaluated(tmp_path_factory.mktemp("case"))
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +38,23 @@ def unpacked(text, kind):
 
 
 class _Seen(HTMLParser):
-    """Collect what defines the numbers of a page."""
+    """Collect what defines the numbers of a page, and the names that need a definition."""
 
     def __init__(self):
         super().__init__()
         self.cards, self.heads, self.open = [], [], []
+        self.columns, self.defined, self.terms = set(), set(), {}
+        self.inside, self.table, self.column, self.last = "", [], 0, ""
 
     def handle_starttag(self, tag, attrs):
         facts = dict(attrs)
+        self.inside = tag if tag in ("th", "td", "dt", "dd", "small") else self.inside
+        if tag == "table":
+            self.table = []
+        if tag == "tr":
+            self.column = -1
+        if tag in ("th", "td"):
+            self.column += 1
         if facts.get("class") == "card":
             self.cards.append(facts.get("title", ""))
         if tag == "abbr" and self.open and self.open[-1] == "th":
@@ -57,7 +62,23 @@ class _Seen(HTMLParser):
         if tag in ("th", "abbr"):
             self.open.append(tag)
 
+    def handle_data(self, data):
+        text = data.strip()
+        if not text:
+            return
+        if self.inside == "th":
+            self.table.append(text)
+            self.columns.add(text)
+        if self.inside == "td" and self.column == 0 and self.table[0] == "signal":
+            self.columns.add(text)
+        if self.inside == "dt":
+            self.last = text
+            self.defined.add(text)
+        if self.inside == "dd":
+            self.terms[self.last] = self.terms.get(self.last, "") + text
+
     def handle_endtag(self, tag):
+        self.inside = "" if tag == self.inside else self.inside
         if self.open and self.open[-1] == tag:
             self.open.pop()
 
@@ -73,6 +94,69 @@ def test_every_number_has_a_definition_and_the_command_that_made_it(case):
         meaning, _, command = title.partition(" — made by: ")
         assert len(meaning) > 3 or "frame" in meaning, title
         assert command == done.command
+
+
+def test_every_name_in_tables_figures_and_panel_is_in_the_glossary(case, held):
+    run, done = case
+    html = (run / "report.html").read_text()
+    page = _Seen()
+    page.feed(html)
+    panel = {"value", "log odds", "rank", "map row", "similarity", "from truth", "own threshold"}
+    assert {"decided", "far_at_95", "top1_w5", "tao_window", "auroc"} <= page.columns
+    assert page.columns - panel - page.defined == set()
+    shown = {signal["name"] for signal in held[2]["signals"]}
+    shown |= {*figures.TRACED, *figures.STRICT, *done.judgement.detector.columns}
+    assert {"tao_rival", "recursive", "entropy", "fused"} <= shown
+    assert shown - page.defined == set()
+    assert all(len(page.terms[name]) > 8 for name in shown)
+    # Names that stand in a sentence, a reason or a definition.
+    said = [*done.sentences, *done.judgement.verdicts["reason"], *page.terms.values()]
+    words = {w for text in said for w in re.findall(r"[a-z]+[0-9]*(?:_[a-z0-9]+)+", text)}
+    known = {"map_recall", "map_poses", "r_in", "r_out", "r_in_m", "r_out_m", "s_1", "s_2"}
+    assert words - page.defined - known - {"warming_up", "no_candidates"} - facts_of(page) == set()
+
+
+def facts_of(page):
+    """Names in the section of settings: they are keys of the judge's configuration."""
+    return set(re.findall(r"[a-z]+(?:_[a-z0-9]+)+", " ".join(
+        page.terms.get(name, "") for name in ("judge's settings", "sha256", "judged by", "command")
+    )))  # fmt: skip
+
+
+def test_where_the_data_come_from_is_said_quietly_and_warnings_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "draw", lambda judgement: ())
+    run, truth = judged.seal(tmp_path, n=12, notes=("odometry simulated",))
+    html = (evaluate(run, truth, judged.config()).run / "report.html").read_text()
+    note = html.split('class="notes"')[1].split("</section>")[0]
+    assert "odometry simulated" in note
+    assert html.count("odometry simulated") == 1
+    alarms = re.findall(r'<(?:p|li) class="[^"]*warn[^"]*">(.*?)</(?:p|li)>', html, re.DOTALL)
+    assert TOO_SHORT in [re.sub(r"<[^>]*>", "", text).strip() for text in alarms]
+
+
+def test_a_healthy_run_alarms_nobody_and_a_useless_one_does(case):
+    judgement = case[1].judgement
+    html = (case[0] / "report.html").read_text()
+    assert ("warn" in re.sub(r"<style>.*?</style>", "", html, flags=re.DOTALL)) == bool(
+        warnings(judgement)
+    )
+    test = judgement.splits.name == "test"
+    verdicts = judgement.verdicts | {
+        "verdict": np.where(test, "accept", judgement.verdicts["verdict"])
+    }
+    blind = judgement._replace(
+        verdicts=verdicts, outcome=np.where(test, "accepted_wrong", judgement.outcome)
+    )
+    assert NO_SHIELD in warnings(blind)
+    assert find_words(blind)[0] in warnings(blind)
+
+
+def test_an_interval_of_no_width_is_called_unknown_and_explained(case):
+    row = {"far_lo": 0.0, "far_hi": 0.0, "auroc_lo": 0.1, "auroc_hi": 0.2}
+    assert span(row, "far").startswith(UNKNOWN)
+    assert span(row, "auroc") == "95 % interval 0.100 to 0.200"
+    assert UNKNOWN in glossary()
+    assert "not bounded" not in (case[0] / "report.html").read_text()
 
 
 def test_the_first_screen_says_what_was_found_before_any_table(case):
@@ -196,6 +280,7 @@ def test_marking_keeps_the_text_and_takes_the_longest_word_once():
 
 def test_no_definition_is_empty():
     assert all(len(meaning) > 10 for meaning in glossary().values())
+    assert all(len(meaning) > 10 for meaning in names_of_signals().values())
 
 
 def test_a_page_without_route_words_or_pictures_renders():

@@ -10,7 +10,7 @@ import judged
 import pytest
 
 from taojax.audit import figures
-from taojax.audit.evaluate import evaluate
+from taojax.audit.glossary import names_of_signals
 from taojax.audit.report import write_summary
 
 BROWSER = next(
@@ -23,11 +23,7 @@ needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium to open 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    run, truth = judged.seal(tmp_path_factory.mktemp("case"))
-    with pytest.MonkeyPatch.context() as patch:
-        # Pictures take most of the time; one is enough for the page.
-        patch.setattr(figures, "draw", lambda judgement: (figures.retrieval(judgement),))
-        return run, evaluate(run, truth, judged.config())
+    return judged.evaluated(tmp_path_factory.mktemp("case"))
 
 
 def opened(page, fragment="", script="", *flags):
@@ -98,6 +94,11 @@ seen.off = Math.hypot(
   middle[0] - view.left - view.width / 2, middle[1] - view.top - view.height / 2);
 document.querySelector("#route-key button").click();
 seen.next = frame();
+seen.rods = document.querySelectorAll("#route-terms .rod").length;
+seen.reason = at("route-reason").textContent;
+const named = document.querySelectorAll("#route-signals td:first-child");
+seen.named = [...named].map((cell) => cell.textContent);
+seen.high = Number(at("route-map").getAttribute("viewBox").split(" ")[3]);
 press("ArrowRight", { ctrlKey: true }); seen.ctrl = frame();
 for (let i = 0; i < 500; i++) press("ArrowRight");
 seen.last = frame();
@@ -124,6 +125,11 @@ def test_clicking_scrubbing_and_keys_change_the_shown_frame(case, tmp_path):
     assert seen["terms"] == len(judgement.detector.columns)
     assert seen["signals"] == len(judgement.metrics["signal"])
     assert seen["off"] < 1.0
+    assert seen["rods"] == seen["terms"]
+    assert seen["reason"] == judgement.verdicts["reason"][seen["next"]]
+    assert set(seen["named"]) <= set(names_of_signals())
+    # The road is straight: its map is no square with a thread in it.
+    assert seen["high"] == 220
     assert seen["ctrl"] == seen["next"]
     # The first kind in the key is the first outcome that occurs, and test frames come first.
     kinds = [name for name in figures.plots.OUTCOMES if (judgement.outcome == name).any()]

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from taojax import records
-from taojax.audit import figures, scenario_figures
+from taojax.audit import figures, scenario_figures, summary
 from taojax.audit.judgement import Evaluation, judge
 from taojax.audit.paste import paste_files
 from taojax.audit.truth import read_truth
@@ -76,6 +76,16 @@ def test_the_trace_figure_holds_every_frame_of_every_scenario(judgement, tmp_pat
     np.testing.assert_allclose(tao, judgement.signals["tao"], rtol=1e-5)
 
 
+def test_the_maps_figure_holds_true_and_answered_positions(judgement, tmp_path):
+    done = Evaluation(tmp_path, judgement, (), "", "taojax audit")
+    table = csv(summary.maps({"default": done}))
+    test = judgement.splits.test.frame
+    np.testing.assert_array_equal(table["frame"], test)
+    true = table[["true_x_m", "true_y_m"]].to_numpy()
+    np.testing.assert_allclose(true, judgement.query_m[test], atol=1e-2)
+    np.testing.assert_allclose(table["x_m"], judgement.signals["x_m"][test], atol=1e-2)
+
+
 def test_the_trace_figure_draws_a_run_without_thresholds(judgement, tmp_path):
     metrics = judgement.metrics | {"threshold": np.full(len(judgement.metrics["signal"]), np.nan)}
     blind = Evaluation(tmp_path, judgement._replace(metrics=metrics), (), "", "taojax audit")
@@ -86,9 +96,9 @@ def test_the_pasted_tables_hold_the_main_signals_with_their_intervals(judgement)
     files = paste_files(judgement, "taojax evaluate run")
     row = metric_row(judgement, "top1")
     cell = f"{row['auroc']:.3f} [{row['auroc_lo']:.3f}, {row['auroc_hi']:.3f}]"
-    for text in files.values():
-        assert cell in text
-        assert "taojax evaluate run" in text
+    for name in ("tables/main.md", "tables/main.tex"):
+        assert cell in files[name]
+        assert "taojax evaluate run" in files[name]
     markdown = files["tables/main.md"].splitlines()
     lines = [line for line in markdown if line.startswith("|")]
     assert len({line.count("|") for line in lines}) == 1

@@ -17,7 +17,7 @@ TRACED = ("top1", "top1_w10", "velocity", "tao", "fused")
 """Signals that are drawn."""
 
 
-OURS = ("tao", "fused")
+OURS = ("fused", "tao")
 """Those drawn with thicker lines."""
 
 STRICT = ("top1", "velocity", "c_geom", "tao", "a_aniso")
@@ -113,7 +113,8 @@ def diagnostics(judgement: Judgement) -> Picture:
     caption = (
         "Shaded: truly off the map. Dashed: threshold, frozen on the calibration split. Dotted: "
         "start of the test split. Larger means more likely off the map; the highest half per "
-        "cent of values may leave the panel. A signal without a unit is dimensionless."
+        "cent of values may leave the panel. A signal without a unit is dimensionless; fused is "
+        "the calibrated probability of being off the map."
     )
     return picture(figure, "diagnostics", "Signals over time", caption, csv_text(columns | traces))
 
@@ -122,7 +123,9 @@ def verdict_map(judgement: Judgement) -> Picture:
     """Draw the test frames on the map, coloured by what the verdict led to."""
     test = judgement.splits.name == "test"
     matched = np.stack([judgement.signals["x_m"], judgement.signals["y_m"]], axis=1).astype(float)
-    figure = Figure(figsize=(7.2, 6.4), layout="constrained")
+    wrong = matched[test & (judgement.outcome == "accepted_wrong")]
+    size = plots.map_size(judgement.map_m, judgement.query_m[test], wrong)
+    figure = Figure(figsize=size, layout="constrained")
     plots.verdict_map(
         judgement.map_m, judgement.query_m[test], matched[test], judgement.outcome[test],
         ax=figure.subplots(),
@@ -185,8 +188,11 @@ def roc_and_pr(judgement: Judgement) -> tuple[Picture, ...]:
          "rejected frames truly map-out (precision)"),
     ):  # fmt: skip
         figure = Figure(figsize=(4.8, 4.7), layout="constrained")
-        plots.curves(lines, x=x, y=y, ax=figure.subplots(), strong=OURS)
-        share = f"prevalence of map-out {is_out.mean():.2f}"
+        ax = figure.subplots()
+        plots.curves(lines, x=x, y=y, ax=ax, strong=OURS)
+        coin = ([0, 1], [0, 1]) if name == "roc" else ([0, 1], [is_out.mean()] * 2)
+        ax.plot(*coin, color=plots.PALE, linestyle="--", linewidth=0.8, zorder=1)
+        share = f"prevalence of map-out {is_out.mean():.2f}; thin dashes: a coin"
         csv = _stacked(lines, *(("frr", "detected") if name == "roc" else ("recall", "precision")))
         pictures.append(picture(figure, name, title, f"{basis}; {share}.", csv))
     return tuple(pictures)

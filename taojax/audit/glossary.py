@@ -1,13 +1,14 @@
 """What the words of a report mean, in one place."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
 from taojax.specs import load_spec
 
-_ABSTAINED = "; frames on which the verdict abstains are counted by their probability too"
+_ACCEPTED = "share of the map-out test frames with the verdict accept; abstaining accepts nothing"
+_REJECTED = "share of the in-map test frames with the verdict reject; abstaining rejects nothing"
 
 
 class Piece(NamedTuple):
@@ -43,10 +44,14 @@ def glossary() -> Mapping[str, str]:
         "are fitted on it and then frozen",
         "test frames": "the last part of the recording, one window after the calibration split; "
         "only scored, never fitted on",
-        "False acceptance rate": about("far") + _ABSTAINED,
-        "FAR": about("far") + _ABSTAINED,
-        "False rejection rate": about("frr") + _ABSTAINED,
-        "FRR": about("frr") + _ABSTAINED,
+        "False acceptance rate": _ACCEPTED,
+        "FAR of the verdicts": _ACCEPTED,
+        "FAR at the threshold": about("far"),
+        "FAR": "false acceptance rate: share of the map-out test frames that were accepted",
+        "False rejection rate": _REJECTED,
+        "FRR of the verdicts": _REJECTED,
+        "FRR at the threshold": about("frr"),
+        "FRR": "false rejection rate: share of the in-map test frames that were rejected",
         "first rejection": about("delay_frames"),
         "AUROC": about("auroc"),
         "AUPR": about("aupr_out"),
@@ -55,6 +60,8 @@ def glossary() -> Mapping[str, str]:
         "threshold": about("threshold"),
         "probability": "calibrated probability of being map-out, from the sealed signals of the "
         "frame alone; `fused` in tables and figures",
+        "interval unknown": "every resample of the frames gives this same number, as it does when "
+        "all frames or none are counted; that is no proof that it is exact",
         "95 % interval": "from a circular block bootstrap over time: whole blocks of frames are "
         "drawn again, because neighbours repeat each other",
         "tao": about("tao", "signals"),
@@ -65,6 +72,37 @@ def glossary() -> Mapping[str, str]:
         "stays under alpha in the stated share of recordings",
         "median": "half of the values lie below",
     }
+
+
+FUSED = "calibrated probability of being off the map, from the sealed signals of the frame alone"
+
+
+@cache
+def names_of_signals() -> Mapping[str, str]:
+    """Return every signal, and `fused`, with its meaning and unit."""
+    found = {}
+    for column in load_spec("signals")["columns"]:
+        if column.get("signal"):
+            unit = column.get("unit", "1")
+            found[column["name"]] = column["about"] + (f" [{unit}]" if unit != "1" else "")
+    return found | {"fused": FUSED}
+
+
+def names_of_tables(specs: Sequence[str]) -> dict[str, str]:
+    """Return the columns of some tables with their meanings; one interval stands for all.
+
+    Args:
+        specs: names of table specs; where two define one column, both are told.
+    """
+    found: dict[str, list[str]] = {}
+    for spec in specs:
+        columns = {column["name"]: column for column in load_spec(spec)["columns"]}
+        bounds = {f"{name}_{end}" for name in columns for end in ("lo", "hi")}
+        for name, column in columns.items():
+            if name not in bounds and column.get("about"):
+                told = found.setdefault(name, [])
+                told += [column["about"]] if column["about"] not in told else []
+    return {name: "; or: ".join(told) for name, told in found.items()}
 
 
 def marked(sentence: str, words: Mapping[str, str]) -> list[Piece]:

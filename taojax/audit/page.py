@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taojax.audit.figures import Picture
-from taojax.audit.glossary import marked
-from taojax.audit.verdicts import plain
+from taojax.audit.glossary import marked, names_of_signals
+from taojax.audit.words import UNKNOWN
 from taojax.specs import load_spec
+from taojax.verdicts import plain
 
 _HALF = 5  # columns up to which two tables fit side by side
 
@@ -57,8 +58,17 @@ class Page(NamedTuple):
     lead: Sequence[str] = ()
     """Sentences of the first screen, above the numbers; `headline` follows below them."""
 
+    first: Sequence[Grid] = ()
+    """Tables right below the cards."""
+
     words: Mapping[str, str] = {}
     """Word -> definition; what hovering over it in a sentence tells."""
+
+    terms: Mapping[str, Mapping[str, str]] = {}
+    """Heading -> name -> definition: names of signals and columns, which no sentence marks."""
+
+    warnings: Sequence[str] = ()
+    """Sentences of `lead` and `headline` that should alarm."""
 
     route: str = ""
     """JSON from `route.route_json`; empty = no section along the route."""
@@ -71,14 +81,6 @@ def number(value: float, column: Mapping[str, Any]) -> str:
     if column.get("type") == "int":
         return f"{value:.0f}"
     return f"{value:.3f}" if column.get("max") == 1 else plain(value)
-
-
-def _signal_titles() -> dict[str, str]:
-    titles = {}
-    for column in load_spec("signals")["columns"]:
-        if column.get("signal"):
-            titles[column["name"]] = f"{column['about']} [{column.get('unit', '1')}]"
-    return titles | {"fused": "calibrated probability of being map-out"}
 
 
 def grid(
@@ -101,7 +103,7 @@ def grid(
     specs = {column["name"]: column for column in load_spec(name)["columns"]}
     bounds = {f"{c}_{end}" for c in specs for end in ("lo", "hi")}
     shown = columns or [c for c in specs if c not in bounds]
-    titles, n = _signal_titles(), len(next(iter(table.values())))
+    titles, n = names_of_signals(), len(next(iter(table.values())))
     rows: list[list[Cell]] = [[] for _ in range(n)]
     for column in shown:
         kind = specs[column].get("type")
@@ -114,7 +116,7 @@ def grid(
             if f"{column}_lo" in specs and np.isfinite(table[f"{column}_lo"][at]):
                 low, high = table[f"{column}_lo"][at], table[f"{column}_hi"][at]
                 ends = [number(float(v), specs[column]) for v in (low, high)]
-                small = " to ".join(ends) if low < high else "not bounded"
+                small = " to ".join(ends) if low < high else UNKNOWN
             row.append(Cell(number(float(value), specs[column]), small))
     head = [
         Cell(c, specs[c].get("unit", ""), specs[c].get("about", ""), specs[c].get("type") == "text")

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from taojax.audit.counts import count_files
 from taojax.audit.judgement import Judgement
-from taojax.audit.verdicts import plain
 from taojax.audit.words import MAIN, metric_row
+from taojax.verdicts import plain
 
 _COLUMNS = {
     "auroc": "AUROC, all",
@@ -64,11 +65,14 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]], about: str, co
 
 
 def paste_files(judgement: Judgement, command: str) -> dict[str, str]:
-    """Return the main signals at the main metrics as Markdown and LaTeX under `tables/`.
+    """Return the main signals as Markdown and LaTeX, and the counts behind the verdicts.
 
     Args:
         judgement: of the run.
-        command: what made it; stands below the table or in a comment.
+        command: what made it; stands below the table of signals or in a comment.
+
+    Returns:
+        Path under the run folder, in `tables/` -> text.
     """
     head = ["signal", *_COLUMNS.values()]
     found = [(name, metric_row(judgement, name)) for name in MAIN]
@@ -77,4 +81,4 @@ def paste_files(judgement: Judgement, command: str) -> dict[str, str]:
     return {
         "tables/main.md": _markdown(head, rows, about, command),
         "tables/main.tex": _latex(head, rows, about, command),
-    }
+    } | count_files(judgement)

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from taojax.audit import figures, scenario_figures, summary, tables
+from taojax.audit.counts import VERDICT_FAR, VERDICT_FRR, counts_table, rates_of, rates_table
 from taojax.audit.figures import Picture
-from taojax.audit.glossary import about, glossary
+from taojax.audit.glossary import about, glossary, names_of_signals, names_of_tables
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.page import Cell, Grid, Page, grid, render
 from taojax.audit.route import route_json
-from taojax.audit.words import MAIN, lead_words, metric_row, rate, span
+from taojax.audit.words import MAIN, lead_words, metric_row, rate, span, warnings
 from taojax.specs import read_npz, write_atomically
 
 _ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")
@@ -25,6 +26,10 @@ SIMULATED = ("The world is simulated; nothing here was measured on the paper's r
 """What the built-in world must say of itself."""
 
 _NOT_OURS = "Columns paper_* are the paper's figures on its own recording, not ours."
+_RATES = (
+    "The verdicts may abstain; a signal at its threshold may not. So that signals and rivals can "
+    "be compared, every FAR and FRR in the tables further down is one at the threshold."
+)
 _FROZEN = ("signal", "threshold", "far", "frr", "delay_frames", "n_exits", "n_censored")
 
 
@@ -34,24 +39,22 @@ def _big(value: float) -> str:
 
 def _cards(judgement: Judgement) -> list[Cell]:
     """Return the numbers of the first screen."""
-    test, row = judgement.splits.test.frame, metric_row(judgement, "fused")
+    test, rates = judgement.splits.test.frame, rates_of(judgement)
     tao = metric_row(judgement, "tao")
     verdict = judgement.verdicts["verdict"][test]
     cards = [
         Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", glossary()[said])
         for word, said in (("accept", "accepted"), ("reject", "rejected"), ("abstain", "abstained"))
     ]
-    far = (
-        f"FAR of the verdict's rule, {span(row, 'far')}, n = {row['n_out_test']:.0f} map-out frames"
-    )
-    frr = f"FRR of the verdict's rule, {span(row, 'frr')}, n = {row['n_in_test']:.0f} in-map frames"
-    auroc = f"AUROC of tao, {span(tao, 'auroc')}, prevalence {tao['prevalence']:.2f}"
-    return [
-        *cards,
-        Cell(_big(row["far"]), far, glossary()["FAR"]),
-        Cell(_big(row["frr"]), frr, glossary()["FRR"]),
-        Cell(_big(tao["auroc"]), auroc, about("auroc")),
-    ]
+    for name, done in ((VERDICT_FAR, "accepted"), (VERDICT_FRR, "rejected")):
+        row = rates[name]
+        counted = f"{int(row['n'])} of {int(row['n_of'])} {row['among']} test frames {done}"
+        sure = span(row, "value").partition(":")[0]
+        small = f"{name}: {counted}; {sure}" if row["n_of"] else f"{name}: no frames"
+        cards.append(Cell(_big(row["value"]), small, glossary()[name]))
+    sure = span(tao, "auroc").partition(":")[0]
+    auroc = f"AUROC of tao, {sure}, prevalence {tao['prevalence']:.2f}"
+    return [*cards, Cell(_big(tao["auroc"]), auroc, about("auroc"))]
 
 
 def _facts(done: Evaluation) -> dict[str, str]:
@@ -94,6 +97,22 @@ def _main(title: str, table: tables.Table, columns: Sequence[str]) -> Grid:
     return grid("metrics", table, title=title, columns=columns)._replace(main=MAIN)
 
 
+def _first_grids(judgement: Judgement) -> list[Grid]:
+    """Return what the sentences and cards count, so that they can be reconciled."""
+    audit = judgement.config.audit
+    where = (
+        f"In the map: truth within {audit.r_in_m:g} m of a map pose; off the map: beyond "
+        f"{audit.r_out_m:g} m; grey: between. The threshold is that of the probability."
+    )
+    return [
+        grid("counts", counts_table(judgement), title="Every frame, once", note=where),
+        grid(
+            "rates", rates_table(judgement), title="What each rate counts", note=_RATES,
+            columns=("rate", "counted", "among", "n", "n_of", "value"),
+        )._replace(is_half=True),
+    ]  # fmt: skip
+
+
 def _run_grids(judgement: Judgement) -> list[Grid]:
     table = judgement.metrics
     runtime = {name: values[:-1] for name, values in table.items()}
@@ -110,6 +129,12 @@ def _run_grids(judgement: Judgement) -> list[Grid]:
         *_micro_grids(judgement.micro),
         grid("metrics", probability, title="Calibrated probability", columns=scores),
     ]
+
+
+def _terms() -> dict[str, Mapping[str, str]]:
+    """Return the definitions of all names in tables, figures and the frame panel, by section."""
+    tables_here = ("counts", "rates", "errors", "recall", "metrics", "conformal", "micro")
+    return {"Signals": names_of_signals(), "Columns of the tables": names_of_tables(tables_here)}
 
 
 def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
@@ -132,11 +157,14 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
             lead=lead,
             headline=[sentence for sentence in done.sentences if sentence not in lead],
             cards=_cards(judgement),
+            first=_first_grids(judgement),
             grids=_run_grids(judgement),
             pictures=pictures,
             facts=_facts(done),
             command=done.command,
             words=glossary(),
+            terms=_terms(),
+            warnings=warnings(judgement),
             route=route_json(judgement, found["index"], found["similarity"]),
         )
     )
@@ -145,12 +173,13 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
 def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> list[str]:
     said = []
     for name, done in summary.cut_maps(scenarios).items():
-        tao, top1, fused = (metric_row(done.judgement, s) for s in ("tao", "top1", "fused"))
+        tao, top1 = (metric_row(done.judgement, s) for s in ("tao", "top1"))
+        far = rates_of(done.judgement)[VERDICT_FAR]
         said.append(
             f"{name}: {int(tao['n_out'])} of {len(done.judgement.label)} queries are off the map. "
-            f"AUROC: tao {rate(tao, 'auroc')}, best similarity {rate(top1, 'auroc')}. False "
-            f"acceptance at the frozen threshold: verdicts {rate(fused, 'far')}, best similarity "
-            f"{rate(top1, 'far')} (n = {int(tao['n_out_test'])})."
+            f"AUROC: tao {rate(tao, 'auroc')}, best similarity {rate(top1, 'auroc')}. Of "
+            f"{int(tao['n_out_test'])} map-out test frames the verdicts accepted the share "
+            f"{rate(far, 'value')}, the best similarity at its threshold {rate(top1, 'far')}."
         )
     micro = base.judgement.micro
     for radius in np.unique(micro["radius_m"]):
@@ -181,10 +210,9 @@ def _mapout_columns(key: str) -> tuple[str, ...]:
 def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
     cards = []
     for name, done in summary.cut_maps(scenarios).items():
-        row = metric_row(done.judgement, "fused")
-        cards.append(
-            Cell(_big(row["far"]), f"{name}: FAR of the verdicts, {span(row, 'far')}", about("far"))
-        )
+        row = rates_of(done.judgement)[VERDICT_FAR]
+        small = f"{name}: {VERDICT_FAR}, {span(row, 'value')}, n = {int(row['n_of'])}"
+        cards.append(Cell(_big(row["value"]), small, glossary()[VERDICT_FAR]))
     return cards
 
 
@@ -229,6 +257,10 @@ def write_summary(
         notes=notes,
         headline=words,
         words=glossary(),
+        terms={
+            "Signals": names_of_signals(),
+            "Columns of the tables": names_of_tables(("mapout", "recall", "micro")),
+        },
         cards=_summary_cards(scenarios),
         grids=[
             grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: AUROC",

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from taojax.audit.glossary import FUSED as FUSED_MEANS
 from taojax.audit.judgement import Judgement
 from taojax.audit.tables import FUSED
-from taojax.detector import log_odds_terms
 from taojax.plots import OUTCOMES
 from taojax.specs import load_spec
 
@@ -59,18 +59,13 @@ def _candidates(
 
 
 def _model(judgement: Judgement, names: list[str]) -> dict[str, Any]:
-    """Return what turns signals into log odds, and the mean in-map terms to hold them against."""
-    detector, fitted = judgement.detector, judgement.splits.calibration
-    inside = {name: fitted.signals[name][fitted.is_in] for name in detector.columns}
-    level = np.zeros(len(detector.columns))
-    if fitted.is_in.any():
-        level = log_odds_terms(detector, inside).mean(axis=0)
+    """Return what turns signals into log odds above the mean in-map frame."""
+    detector = judgement.detector
     return {
         "columns": [names.index(name) for name in detector.columns],
         "mean": detector.mean.tolist(),
         "scale": detector.scale.tolist(),
         "weight": detector.weight.tolist(),
-        "level": level.tolist(),
         "threshold": None if np.isnan(detector.threshold) else float(detector.threshold),
     }
 
@@ -80,7 +75,7 @@ def _signals(judgement: Judgement) -> list[dict[str, Any]]:
     specs = {c["name"]: c for c in load_spec("signals")["columns"] if c.get("signal")}
     table, found = judgement.metrics, []
     for name, threshold in zip(table["signal"], table["threshold"], strict=True):
-        spec = specs.get(str(name), {"about": "calibrated probability of being map-out"})
+        spec = specs.get(str(name), {"about": FUSED_MEANS})
         found.append(
             {
                 "name": str(name),

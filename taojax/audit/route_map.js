@@ -1,5 +1,5 @@
 // Along the route, 2 of 3: the map and the time line.
-const WIDE = 760, HIGH = 560, EDGE = 26, ZOOMS = [1, 2, 4, 8, 16, 32];
+const LEAST_HIGH = 220, MOST_HIGH = 600, EDGE = 26, FOOT = 30, ZOOMS = [1, 2, 4, 8, 16, 32];
 const view = at("route-map"), still = at("route-still"), moving = at("route-moving");
 let low = [Infinity, Infinity], high = [-Infinity, -Infinity], zoom = 0, frame = 0;
 for (const points of [map, truth]) {
@@ -9,7 +9,14 @@ for (const points of [map, truth]) {
   }
 }
 const span = [high[0] - low[0] || 1, high[1] - low[1] || 1];
-const fit = Math.min((WIDE - 2 * EDGE) / span[0], (HIGH - 2 * EDGE) / span[1]);
+// A corridor takes the whole width, and no map is higher than it needs to be.
+const isFlat = span[1] < 0.3 * span[0], WIDE = isFlat ? 1140 : 760;
+document.querySelector(".route").classList.toggle("flat", isFlat);
+const need = ((WIDE - 2 * EDGE) * span[1]) / span[0] + 2 * EDGE + FOOT;
+const HIGH = Math.round(Math.max(LEAST_HIGH, Math.min(MOST_HIGH, need)));
+const fit = Math.min((WIDE - 2 * EDGE) / span[0], (HIGH - 2 * EDGE - FOOT) / span[1]);
+view.setAttribute("viewBox", `0 0 ${WIDE} ${HIGH}`);
+document.querySelector("#route-map .scale").setAttribute("transform", `translate(18 ${HIGH - 12})`);
 const scale = () => fit * ZOOMS[zoom];
 const place = (points, i) => [points[2 * i] * scale(), -points[2 * i + 1] * scale()];
 const known = (points, i) => !Number.isNaN(points[2 * i]);
@@ -87,10 +94,11 @@ const aim = () => {
   const middle = zoom
     ? place(truth, frame)
     : [(low[0] + span[0] / 2) * scale(), -(low[1] + span[1] / 2) * scale()];
-  const move = `translate(${(WIDE / 2 - middle[0]).toFixed(1)} ${(HIGH / 2 - middle[1]).toFixed(1)})`;
+  const up = zoom ? 0 : FOOT / 2;
+  const move = `translate(${(WIDE / 2 - middle[0]).toFixed(1)} ${(HIGH / 2 - up - middle[1]).toFixed(1)})`;
   still.setAttribute("transform", move);
   moving.setAttribute("transform", move);
-  return [WIDE / 2 - middle[0], HIGH / 2 - middle[1]];
+  return [WIDE / 2 - middle[0], HIGH / 2 - up - middle[1]];
 };
 
 // ---- time line ----

@@ -14,8 +14,8 @@ const bar = (excess, widest) => {
   return made;
 };
 const fillTerms = (i) => {
-  const { columns, mean, scale: size, weight, level: inside } = run.model;
-  const excess = columns.map((c, j) => ((value(c, i) - mean[j]) / size[j]) * weight[j] - inside[j]);
+  const { columns, mean, scale: size, weight } = run.model;
+  const excess = columns.map((c, j) => ((value(c, i) - mean[j]) / size[j]) * weight[j]);
   const widest = Math.max(1, ...excess.map(Math.abs));
   const order = columns.map((_, j) => j).sort((a, b) => excess[b] - excess[a]);
   fill("route-terms", order.map((j) => {

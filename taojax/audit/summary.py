@@ -98,11 +98,16 @@ def compare(scenarios: Mapping[str, Evaluation]) -> Picture:
         paper = np.array([PAPER_TABLE_2.get(name, (np.nan,) * 5) for name in cut], dtype=float)
         reference = {"top1": paper[:, at[0]], "tao_rank": paper[:, at[1]]}
         plots.scenario_dots(groups, tuple(cut), reference=reference, label=label, ax=ax)
+        if (legend := ax.get_legend()) is not None:
+            legend.remove()
         stacked = np.stack([groups[signal] for signal in _COMPARED], axis=1).reshape(-1, 3)
         columns |= {f"{key}{end}": stacked[:, i] for i, end in enumerate(("", "_lo", "_hi"))}
+    lines = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*lines, loc="outside upper center", ncol=5, frameon=False, fontsize=8)
     caption = (
         "Bars: 95 % block-bootstrap intervals. Hollow diamonds: the paper's figures for the best "
-        "similarity and for TAO, on its own recording."
+        "similarity and for TAO, on its own recording. FAR: each signal at its own frozen "
+        "threshold, without abstaining."
     )
     return picture(figure, "mapout", "Map-out scenarios", caption, csv_text(columns))
 
@@ -111,9 +116,13 @@ def maps(scenarios: Mapping[str, Evaluation]) -> Picture:
     """Draw the verdict map of every scenario."""
     n = len(scenarios)
     across = min(n, 2)
-    figure = Figure(figsize=(5.4 * across, 5.6 * (-(-n // across))), layout="constrained")
+    drawn = [part for done in scenarios.values()
+             for part in (done.judgement.map_m, done.judgement.query_m)]  # fmt: skip
+    wide, high = plots.map_size(*drawn, wide_in=5.4, most_in=4.8)
+    figure = Figure(figsize=(wide * across, high * (-(-n // across))), layout="constrained")
     axes = figure.subplots(-(-n // across), across, squeeze=False).ravel()
-    parts: dict[str, list[np.ndarray]] = {"scenario": [], "frame": [], "outcome": []}
+    heads = ("scenario", "frame", "true_x_m", "true_y_m", "x_m", "y_m", "outcome")
+    parts: dict[str, list[np.ndarray]] = {head: [] for head in heads}
     for ax, (name, done) in zip(axes, scenarios.items(), strict=False):
         judgement = done.judgement
         test = judgement.splits.test.frame
@@ -123,9 +132,12 @@ def maps(scenarios: Mapping[str, Evaluation]) -> Picture:
             judgement.map_m, judgement.query_m[test], matched, judgement.outcome[test], ax=ax
         )
         ax.set_title(name, fontsize=10)
-        parts["scenario"].append(np.full(len(test), name))
-        parts["frame"].append(test)
-        parts["outcome"].append(judgement.outcome[test])
+        behind = (
+            np.full(len(test), name), test, *judgement.query_m[test].T, *matched.T,
+            judgement.outcome[test],
+        )  # fmt: skip
+        for head, values in zip(heads, behind, strict=True):
+            parts[head].append(values)
     for ax in axes[n:]:
         ax.set_axis_off()
     csv = csv_text({key: np.concatenate(values) for key, values in parts.items()})

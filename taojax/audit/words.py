@@ -5,8 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from taojax.audit.counts import (
+    LEFT_IN,
+    LEFT_OUT,
+    THRESHOLD_FAR,
+    THRESHOLD_FRR,
+    VERDICT_FAR,
+    VERDICT_FRR,
+    rates_of,
+)
 from taojax.audit.judgement import Judgement
-from taojax.audit.verdicts import plain
+from taojax.verdicts import plain
 
 _JOIN_FRAMES = 5  # wrong acceptances this close together are told as one stretch
 _MOST_STRETCHES = 3
@@ -15,12 +24,20 @@ MAIN = ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused")
 
 _MOST = 0.5  # beyond this share a rate is called "most"
 
+TOO_SHORT = "The recording is too short to hold a test split: nothing is scored out of sample."
+BLIND = "The calibration split holds no in-map frame, so there is no threshold."
+NO_SHIELD = "Here taojax does not protect the map: it accepts most answers given off the map."
+
 
 def metric_row(judgement: Judgement, signal: str) -> dict[str, Any]:
     """Return one row of metrics.csv by the name of its signal."""
     table = judgement.metrics
     at = list(table["signal"]).index(signal)
     return {name: values[at] for name, values in table.items()}
+
+
+UNKNOWN = "interval unknown"
+"""Said where every resample gives the same number; the glossary explains it."""
 
 
 def span(row: Mapping[str, Any], name: str) -> str:
@@ -33,7 +50,7 @@ def span(row: Mapping[str, Any], name: str) -> str:
     if not np.isfinite(low):
         return "no interval: too few resamples hold both classes"
     if low == high:
-        return "not bounded: every resample agrees"
+        return f"{UNKNOWN}: too few frames differ"
     return f"95 % interval {low:.3f} to {high:.3f}"
 
 
@@ -48,55 +65,70 @@ def _counts(judgement: Judgement) -> list[str]:
     test, verdict = judgement.splits.test, judgement.verdicts["verdict"]
     n = len(test.frame)
     if n == 0:
-        return ["The recording is too short to hold a test split: nothing is scored out of sample."]
+        return [TOO_SHORT]
     count = {v: int((verdict[test.frame] == v).sum()) for v in ("accept", "reject", "abstain")}
     outcome = judgement.outcome[test.frame]
     right, wrong = (int((outcome == f"accepted_{kind}").sum()) for kind in ("in", "wrong"))
     share = f" ({100 * wrong / (right + wrong):.0f} % of them wrong)" if right + wrong else ""
+    n_grey = count["accept"] - right - wrong
+    tail = f"; {n_grey} of the accepted lie in the grey zone, where none is right or wrong"
     return [
         f"Of the {n} test frames ({test.frame[0]} to {test.frame[-1]}) taojax accepted "
         f"{count['accept']}, {right} at the right place and {wrong} at a wrong place{share}, "
-        f"rejected {count['reject']} and abstained on {count['abstain']}."
+        f"rejected {count['reject']} and abstained on {count['abstain']}{tail if n_grey else ''}."
     ]
 
 
 def _false_acceptance(judgement: Judgement) -> list[str]:
-    row = metric_row(judgement, "fused")
-    if np.isnan(row["threshold"]):
-        return ["The calibration split holds no in-map frame, so there is no threshold."]
-    n_out = int(row["n_out_test"])
-    rule = f"probability {plain(row['threshold'])}, frozen on the calibration split"
+    if np.isnan(judgement.detector.threshold):
+        return [BLIND]
+    rates = rates_of(judgement)
+    far, left = rates[VERDICT_FAR], rates[LEFT_OUT]
+    n, n_out, n_left = (int(x) for x in (far["n"], far["n_of"], left["n"]))
     if not n_out:
-        return [
-            "The test split holds no map-out frame, so there is no false acceptance rate (at or "
-            f"below {rule})."
-        ]
-    said = []
-    if row["far"] > _MOST:
-        said.append(
-            "At this threshold taojax does not protect the map: it accepts most answers "
-            "given off the map."
-        )
+        return ["The test split holds no map-out frame, so there is no false acceptance rate."]
+    said = [NO_SHIELD] if far["value"] > _MOST else []
+    prevalence = metric_row(judgement, "fused")["prevalence_test"]
     said.append(
-        f"False acceptance rate {rate(row, 'far')}: {round(row['far'] * n_out)} of {n_out} map-out "
-        f"test frames (prevalence {row['prevalence_test']:.2f}) lie at or below {rule}."
+        f"False acceptance rate {rate(far, 'value')}: of {n_out} map-out test frames (prevalence "
+        f"{prevalence:.2f}) the verdicts accepted {n}, rejected {n_out - n - n_left} and "
+        f"abstained on {n_left}."
     )
     return said
 
 
 def _false_rejection(judgement: Judgement) -> list[str]:
     row = metric_row(judgement, "fused")
-    if np.isnan(row["threshold"]):
+    if np.isnan(judgement.detector.threshold):
         return []
-    n_in = int(row["n_in_test"])
+    rates = rates_of(judgement)
+    frr, left = rates[VERDICT_FRR], rates[LEFT_IN]
+    n, n_in, n_left = (int(x) for x in (frr["n"], frr["n_of"], left["n"]))
     if not n_in:
         said = "The test split holds no in-map frame, so there is no false rejection rate."
-        return [said, *_delays(row)]
+        return [said, *_alone(judgement, rates), *_delays(row)]
     said = (
-        f"False rejection rate {rate(row, 'frr')}: {round(row['frr'] * n_in)} of {n_in} in-map "
-        "test frames."
+        f"False rejection rate {rate(frr, 'value')}: of {n_in} in-map test frames the verdicts "
+        f"rejected {n}, accepted {n_in - n - n_left} and abstained on {n_left}."
     )
-    return [said, *_delays(row)]
+    return [said, *_alone(judgement, rates), *_delays(row)]
+
+
+def _alone(judgement: Judgement, rates: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Say what the probability alone would do; that is what metrics.csv compares signals by."""
+    parts = []
+    for name, would in ((THRESHOLD_FAR, "accept"), (THRESHOLD_FRR, "reject")):
+        row = rates[name]
+        if row["n_of"]:
+            many = f"{int(row['n'])} of {int(row['n_of'])} {row['among']} test frames"
+            parts.append(f"{would} {many} ({name} {row['value']:.3f})")
+    if not parts:
+        return []
+    level = plain(judgement.detector.threshold)
+    return [
+        f"The probability alone, which cannot abstain, would at the threshold {level}, frozen on "
+        f"the calibration split, {' and '.join(parts)}."
+    ]
 
 
 def _delays(row: Mapping[str, Any]) -> list[str]:
@@ -156,7 +188,8 @@ def _failures(judgement: Judgement) -> list[str]:
         f"; and {more} more stretch{'es' if more > 1 else ''} as short or shorter" if more else ""
     )
     return [
-        f"{len(wrong)} test frames were accepted at a wrong place ({n_off} off the map, "
+        f"{len(wrong)} test {'frames were' if len(wrong) > 1 else 'frame was'} accepted at a wrong "
+        f"place ({n_off} off the map, "
         f"{len(wrong) - n_off} in the map but more than {2 * judgement.config.audit.r_in_m:g} m "
         f"off): {'; '.join(told)}{tail}."
     ]
@@ -185,6 +218,17 @@ def _clock(judgement: Judgement) -> list[str]:
 
 
 _LEAD = (_counts, _false_acceptance, _failures)
+
+
+def warnings(judgement: Judgement) -> tuple[str, ...]:
+    """Return those of the sentences that should alarm the reader."""
+    found = {TOO_SHORT, BLIND, NO_SHIELD, *_clock(judgement)}
+    outcome = judgement.outcome[judgement.splits.test.frame]
+    if np.sum(outcome == "accepted_wrong") > np.sum(outcome == "accepted_in"):
+        found.update(_counts(judgement))
+    if judgement.detector.note.startswith("The probability is a fallback"):
+        found.add(judgement.detector.note)
+    return tuple(sentence for sentence in find_words(judgement) if sentence in found)
 
 
 def lead_words(judgement: Judgement) -> tuple[str, ...]:

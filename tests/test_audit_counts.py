@@ -1,0 +1,119 @@
+"""Every frame is counted once, and a reader can follow each rate to the frames it counts."""
+
+import re
+
+import judged
+import numpy as np
+import pytest
+
+from taojax.audit import counts
+from taojax.audit.words import find_words, metric_row
+from taojax.tables import read_table
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    return judged.evaluated(tmp_path_factory.mktemp("case"))
+
+
+def rows_of(judgement):
+    table = counts.counts_table(judgement)
+    names = ("in_map", "map_out", "grey", "frames")
+    return {
+        str(name): dict(zip(names, values, strict=True))
+        for name, *values in zip(table["decided"], *(table[n] for n in names), strict=True)
+    }
+
+
+def test_rows_and_columns_add_up_to_all_frames(case):
+    judgement = case[1].judgement
+    rows = rows_of(judgement)
+    assert rows["all frames"]["frames"] == len(judgement.label)
+    kinds = list(rows)[: list(rows).index("test split")]
+    for column in ("in_map", "map_out", "grey", "frames"):
+        assert sum(rows[kind][column] for kind in kinds) == rows["test split"][column]
+        splits = ("test split", "calibration split", "gap between the splits")
+        assert sum(rows[name][column] for name in splits) == rows["all frames"][column]
+    for row in rows.values():
+        assert row["in_map"] + row["map_out"] + row["grey"] == row["frames"]
+    test = judgement.splits.name == "test"
+    accepted = (judgement.verdicts["verdict"] == "accept") & test
+    assert rows["accepted"]["frames"] == accepted.sum()
+    assert rows["accepted"]["map_out"] == (accepted & (judgement.label == "map_out")).sum()
+
+
+def test_each_rate_counts_rows_of_the_table(case):
+    judgement = case[1].judgement
+    rows, rates = rows_of(judgement), counts.rates_of(judgement)
+    low, high = "abstained at or below the threshold", "abstained above the threshold"
+    for name, kinds, column in (
+        (counts.VERDICT_FAR, ("accepted",), "map_out"),
+        (counts.THRESHOLD_FAR, ("accepted", low), "map_out"),
+        (counts.LEFT_OUT, (low, high), "map_out"),
+        (counts.VERDICT_FRR, ("rejected",), "in_map"),
+        (counts.THRESHOLD_FRR, ("rejected", high), "in_map"),
+        (counts.LEFT_IN, (low, high), "in_map"),
+    ):
+        rate = rates[name]
+        assert rate["n"] == sum(rows[kind][column] for kind in kinds), name
+        assert rate["n_of"] == rows["test split"][column]
+        np.testing.assert_allclose(rate["value"], rate["n"] / rate["n_of"])
+        assert rate["value_lo"] <= rate["value"] <= rate["value_hi"]
+
+
+def test_the_rates_at_the_threshold_are_those_of_metrics_csv(case):
+    judgement = case[1].judgement
+    row, rates = metric_row(judgement, "fused"), counts.rates_of(judgement)
+    for name, column in ((counts.THRESHOLD_FAR, "far"), (counts.THRESHOLD_FRR, "frr")):
+        for end in ("", "_lo", "_hi"):
+            np.testing.assert_allclose(rates[name][f"value{end}"], row[f"{column}{end}"])
+
+
+def test_the_sentences_say_the_numbers_of_the_table(case):
+    text, rows = " ".join(case[1].sentences), rows_of(case[1].judgement)
+    said = re.search(
+        r"of (\d+) map-out test frames \(prevalence [\d.]+\) the verdicts accepted (\d+), rejected "
+        r"(\d+) and abstained on (\d+)",
+        text,
+    )
+    left = [kind for kind in rows if kind.startswith("abstained")]
+    want = [rows["test split"], rows["accepted"], rows["rejected"]]
+    numbers = [row["map_out"] for row in want] + [sum(rows[kind]["map_out"] for kind in left)]
+    assert [int(number) for number in said.groups()] == numbers
+
+
+def test_both_tables_stand_in_the_run_folder_and_can_be_read_again(case):
+    run, done = case
+    for name in ("counts", "rates"):
+        table = read_table(run / f"tables/{name}.csv", name)
+        made = getattr(counts, f"{name}_table")(done.judgement)
+        assert list(table) == list(made)
+        assert (run / f"tables/{name}.tex").read_text().count("\\\\") == 1 + len(
+            table["frames" if name == "counts" else "rate"]
+        )
+        for column in made:
+            assert not any("," in str(value) for value in made[column])
+
+
+def test_accepted_frames_of_the_grey_zone_are_told_apart(case):
+    judgement = case[1].judgement
+    rows = rows_of(judgement)
+    n = int(rows["accepted"]["grey"])
+    assert n > 0
+    assert f"; {n} of the accepted lie in the grey zone" in find_words(judgement)[0]
+    outcome = judgement.outcome[judgement.splits.test.frame]
+    right, wrong = (int((outcome == f"accepted_{kind}").sum()) for kind in ("in", "wrong"))
+    assert n + right + wrong == rows["accepted"]["frames"]
+
+
+def test_without_a_threshold_everything_is_abstained_on_and_no_rate_pretends(case):
+    judgement = case[1].judgement
+    n = len(judgement.label)
+    blind = judgement._replace(
+        detector=judgement.detector._replace(threshold=np.nan),
+        verdicts=judgement.verdicts | {"verdict": np.full(n, "abstain", dtype=object)},
+    )
+    rows = rows_of(blind)
+    assert rows["abstained"]["frames"] == rows["test split"]["frames"]
+    assert counts.THRESHOLD_FAR not in counts.rates_of(blind)
+    assert any("no threshold" in sentence for sentence in find_words(blind))
