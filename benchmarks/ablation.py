@@ -6,21 +6,49 @@ parts of the fused probability) come from its own columns.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from benchmarks.entrants import Field, field_of, stream
+from benchmarks.pictures import save
 from benchmarks.sets import DataSet, recipes
 from taojax import detector
 from taojax.audit import calibration, metrics
+from taojax.audit.figures import csv_text
 from taojax.config import AuditConfig, Config, StreamConfig
 from taojax.core import association
+from taojax.plots import IN_MAP, MAP_OUT, PALE
 from taojax.runtime import joint
 from taojax.runtime.maps import map_tables
+from taojax.specs import write_atomically
+
+NAN = float("nan")
+
+DETECTOR, FITTED = "tao: ", "probability, test half: "
+"""Beginnings of a variant's name: the detector over all frames, the model on its test half."""
+
+WHOLE = {DETECTOR: "all ingredients", FITTED: "all parts"}
+"""What the variants of each group are held against."""
+
+PANELS = (
+    ("AUROC of tao, all frames", DETECTOR, "auroc"),
+    ("FAR at 95 % of tao, all frames", DETECTOR, "far_at_95"),
+    ("AUROC of the probability, test half", FITTED, "auroc"),
+)
+"""Rows of the figure: title, group of variants, figure of a cell."""
+
+LEAST_SPAN = 0.1
+"""An axis spans at least this much, so that noise does not look like an effect."""
+
+EVEN = 0.005
+"""A difference below it is drawn as none; no interval is computed here."""
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "all ingredients": {},
@@ -67,18 +95,34 @@ def _swapped(module: Any, name: str, value: Any) -> Iterator[None]:
         jax.clear_caches()
 
 
-def _cell(signal: np.ndarray, field: Field) -> str:
+class Cell(NamedTuple):
+    """One variant on one set."""
+
+    auroc: float
+    far_at_95: float = NAN
+    """Of the detector alone."""
+
+    def __str__(self) -> str:
+        far = "" if np.isnan(self.far_at_95) else f" / {self.far_at_95:.2f}"
+        return f"{self.auroc:.3f}{far}"
+
+
+Table = Mapping[str, Mapping[str, Cell]]
+"""Variant -> set -> cell; every variant knows every set."""
+
+
+def _cell(signal: np.ndarray, field: Field) -> Cell:
     known = field.label != "grey"
     values, is_out = signal[known], (field.label == "map_out")[known]
-    return f"{metrics.auroc(values, is_out):.3f} / {metrics.far_at_95(values, is_out):.2f}"
+    return Cell(metrics.auroc(values, is_out), metrics.far_at_95(values, is_out))
 
 
-def _test_cell(columns: dict[str, np.ndarray], field: Field, recall: float) -> str:
+def _test_cell(columns: dict[str, np.ndarray], field: Field, recall: float) -> Cell:
     splits = field.split(columns)
     model = calibration.fit(splits.calibration, recall)
     known = splits.test.is_in | splits.test.is_out
     p = detector.probability(model, splits.test.signals)[known]
-    return f"{metrics.auroc(p, splits.test.is_out[known]):.3f}"
+    return Cell(metrics.auroc(p, splits.test.is_out[known]))
 
 
 def _columns(data: DataSet, config: StreamConfig) -> dict[str, np.ndarray]:
@@ -86,7 +130,7 @@ def _columns(data: DataSet, config: StreamConfig) -> dict[str, np.ndarray]:
     return {name: np.asarray(values, float) for name, values in records.signals.items()}
 
 
-def _rows(data: DataSet) -> dict[str, str]:
+def _rows(data: DataSet) -> dict[str, Cell]:
     """Return variant -> cell for one set."""
     audit = AuditConfig(r_in_m=data.r_in_m, r_out_m=data.r_out_m)
     field = field_of(data, Config(audit=audit))
@@ -94,27 +138,104 @@ def _rows(data: DataSet) -> dict[str, str]:
     recall = float(map_tables(data.map_poses, None, data.map_descriptors).recall)
     for name, settings in SETTINGS.items():
         columns = full if not settings else _columns(data, StreamConfig(**settings))
-        rows[f"tao: {name}"] = _cell(columns["tao"], field)
-    rows["tao: without the recursive filter"] = _cell(full["tao_align"], field)
-    rows["tao: without it, fading window instead of adaptive memory"] = _cell(
+        rows[f"{DETECTOR}{name}"] = _cell(columns["tao"], field)
+    rows[f"{DETECTOR}without the recursive filter"] = _cell(full["tao_align"], field)
+    rows[f"{DETECTOR}without it, fading window instead of adaptive memory"] = _cell(
         full["tao_window"], field
     )
     for name, swap in SWAPS.items():
         with _swapped(*swap):
-            rows[f"tao: {name}"] = _cell(_columns(data, StreamConfig())["tao"], field)
-    rows["probability, test half: all parts"] = _test_cell(full, field, recall)
-    rows["probability, test half: prior of an unknown map"] = _test_cell(
-        full, field, calibration.LIST_RECALL
-    )
+            rows[f"{DETECTOR}{name}"] = _cell(_columns(data, StreamConfig())["tao"], field)
+    rows[f"{FITTED}all parts"] = _test_cell(full, field, recall)
+    rows[f"{FITTED}prior of an unknown map"] = _test_cell(full, field, calibration.LIST_RECALL)
     for name in calibration.DISTINCT:
         # A constant column says nothing: the part is gone, the fit is the same.
         without = full | {name: np.zeros_like(full[name])}
-        rows[f"probability, test half: without {name}"] = _test_cell(without, field, recall)
+        rows[f"{FITTED}without {name}"] = _test_cell(without, field, recall)
     return rows
 
 
+def to_markdown(table: Table) -> str:
+    """Return the table as text."""
+    names = list(next(iter(table.values()), {}))
+    lines = ["| variant | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for variant, cells in table.items():
+        lines.append(f"| {variant} | " + " | ".join(str(cells[n]) for n in names) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def to_csv(table: Table) -> str:
+    """Return one row per variant and set; FAR is blank for the probability."""
+    rows = [(v, name, *cell) for v, cells in table.items() for name, cell in cells.items()]
+    columns = zip(("variant", "set", *Cell._fields), zip(*rows, strict=True), strict=True)
+    # Names hold commas.
+    return csv_text({
+        name: np.array([f'"{v}"' for v in values] if isinstance(values[0], str) else values)
+        for name, values in columns
+    })  # fmt: skip
+
+
+def _panel(values: Mapping[str, float], whole: str, *, falls: bool, ax: Axes) -> None:
+    """Draw one figure of one set: a line at what all ingredients reach, a mark per variant."""
+    level = values[whole]
+    ax.axvline(level, color=PALE, linewidth=1.0, zorder=1)
+    for height, value in enumerate(list(values.values())[::-1]):
+        loss = (value - level) * (1 if falls else -1)
+        marker, colour = ("X", MAP_OUT) if loss > EVEN else ("o", "#888888")
+        marker, colour = ("^", IN_MAP) if loss < -EVEN else (marker, colour)
+        ax.plot((level, value), (height, height), color=colour, linewidth=1.0, zorder=2)
+        ax.plot(value, height, marker, color=colour, markersize=5.5, zorder=3)
+    names = [textwrap.fill(name, 30) for name in values]
+    ax.set_yticks(range(len(values)), names[::-1], fontsize=8)
+    ax.set_ylim(-0.7, len(values) - 0.3)
+    ax.tick_params(axis="x", labelsize=8)
+    ax.grid(axis="x", linewidth=0.3)
+    low, high = min(values.values()), max(values.values())
+    half = max(0.6 * (high - low), LEAST_SPAN / 2)
+    ax.set_xlim((low + high) / 2 - half, (low + high) / 2 + half)
+    ax.locator_params(axis="x", nbins=5)
+
+
+def draw(table: Table) -> Figure:
+    """Draw what each ingredient is worth: sets across, figures down, variants in each panel."""
+    names = list(next(iter(table.values())))
+    sizes = [sum(v.startswith(group) for v in table) for _, group, _ in PANELS]
+    figure = Figure(
+        figsize=(3.0 + 2.2 * len(names), 1.6 + 0.24 * sum(sizes) + 0.5 * len(PANELS)),
+        layout="constrained",
+    )
+    grid = figure.subplots(
+        len(PANELS), len(names), sharey="row", squeeze=False, height_ratios=[n + 2 for n in sizes]
+    )
+    for axes, (title, group, value) in zip(grid, PANELS, strict=True):
+        for ax, name in zip(axes, names, strict=True):
+            values = {
+                variant.removeprefix(group): getattr(cells[name], value)
+                for variant, cells in table.items()
+                if variant.startswith(group)
+            }
+            _panel(values, WHOLE[group], falls=value == "far_at_95", ax=ax)
+            ax.set_xlabel(title.split(",")[0].split(" of ")[0], fontsize=8)
+            if group == PANELS[0][1] and value == PANELS[0][2]:
+                ax.set_title(name, fontsize=9)
+        axes[0].set_ylabel(title, fontsize=8)
+    figure.suptitle(
+        "What each ingredient is worth. Line: all of them. With the change: orange cross worse, "
+        f"blue triangle better, grey dot within {EVEN:g}.\nOne run each, no intervals. Sets named "
+        "simulated/ and range/ are simulated, the others real recordings.",
+        fontsize=9,
+    )
+    return figure
+
+
+def write(out: Path, table: Table) -> None:
+    """Write ablation.md, and ablation.png and .svg with the .csv behind them."""
+    write_atomically(out / "ablation.md", to_markdown(table))
+    save(draw(table), out / "ablation", to_csv(table))
+
+
 def run(out: Path, data: Path, *, only: str = "", say: Callable[[str], None] = print) -> None:
-    """Write ablation.md: variants down, data sets across.
+    """Write the table and the figure: variants down, data sets across.
 
     Args:
         out: folder to write into.
@@ -127,18 +248,13 @@ def run(out: Path, data: Path, *, only: str = "", say: Callable[[str], None] = p
         for recipe in recipes(data, quick=True, only=only)
         if recipe.name in REPRESENTATIVE or only
     ]
-    table: dict[str, dict[str, str]] = {}
+    table: dict[str, dict[str, Cell]] = {}
     for number, recipe in enumerate(chosen, start=1):
         for name, cell in _rows(recipe.make()).items():
             table.setdefault(name, {})[recipe.name] = cell
+        write(out, table)
         say(f"[{number}/{len(chosen)}] {recipe.name}")
-    names = [recipe.name for recipe in chosen]
-    lines = ["| variant | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
-    for name, cells in table.items():
-        lines.append(f"| {name} | " + " | ".join(cells[n] for n in names) + " |")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "ablation.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    say(f"wrote {out / 'ablation.md'}")
+    say(f"wrote {out / 'ablation.md'}, .png, .svg, .csv" if table else "no data set matches")
 
 
 REPRESENTATIVE = (

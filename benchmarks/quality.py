@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.entrants import FITTED, GATES, ORACLES, Entry, Field, compete
+from benchmarks.pictures import save
 from benchmarks.sets import DataSet, Recipe, recipes
 from taojax.audit import bootstrap, calibration, metrics, tables
 from taojax.audit.labels import CalibrationSplit
@@ -263,7 +264,7 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def write(out: Path, rows: Sequence[Row]) -> None:
-    """Write leaderboard.csv, leaderboard.md and leaderboard.png."""
+    """Write leaderboard.csv, .md, .png and .svg."""
     out.mkdir(parents=True, exist_ok=True)
     names = list(dict.fromkeys(name for row in rows for name in row))
     with open(out / "leaderboard.csv", "w", newline="", encoding="utf-8") as file:
@@ -272,7 +273,7 @@ def write(out: Path, rows: Sequence[Row]) -> None:
         for row in rows:
             writer.writerow({k: v for k, v in row.items() if v == v})  # without NaN
     (out / "leaderboard.md").write_text(to_markdown(rows), encoding="utf-8")
-    draw(rows).savefig(out / "leaderboard.png", dpi=140)
+    save(draw(rows), out / "leaderboard")
 
 
 def run(out: Path, data: Path, *, quick: bool, only: str = "") -> None:

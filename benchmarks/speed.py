@@ -38,12 +38,14 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.pictures import save
 from taojax.baselines.mht import MhtParams, mht
 from taojax.config import StreamConfig
 from taojax.runtime import bench
 from taojax.runtime.bench import Row, best_us
+from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
-from taojax.runtime.stream import Frame, init, replay
+from taojax.runtime.stream import init, replay
 from taojax.verbs.bench import simulated_drive
 
 BASELINE = Path(__file__).parent / "speed_baseline.csv"
@@ -181,7 +183,7 @@ def _write(curves: dict[str, Curve], out: Path) -> None:
         writer = csv.writer(file)
         writer.writerow(("curve", "x", "value"))
         writer.writerows((name, f"{x:g}", f"{y:.6g}") for name, c in curves.items() for x, y in c)
-    draw(curves).savefig(out / "scaling.png", dpi=120)
+    save(draw(curves), out / "scaling")
 
 
 def bless(rows: Sequence[Row]) -> None:
@@ -195,7 +197,7 @@ def bless(rows: Sequence[Row]) -> None:
 def run(
     out: Path, *, quick: bool, gate: bool, blessed: bool, say: Callable[[str], None] = print
 ) -> None:
-    """Write bench.csv, scaling.csv and scaling.png.
+    """Write bench.csv, scaling.csv, scaling.png and scaling.svg.
 
     Args:
         out: folder to write into.
@@ -226,7 +228,7 @@ def run(
     _write(curves, out)
     for row in rows:
         say(f"{row.name:34s} {row.value:12.4g} {row.unit}")
-    say(f"wrote {out}/bench.csv, scaling.csv, scaling.png")
+    say(f"wrote {out}/bench.csv, scaling.csv, scaling.png, scaling.svg")
     if blessed:
         bless(rows)
     if gate:

@@ -64,7 +64,7 @@ def test_the_difference_to_the_best_rival_is_zero_for_that_rival_and_paired_for_
             assert row["auroc_minus_rival_lo"] == row["auroc_minus_rival_hi"] == 0.0
 
 
-def test_all_three_files_are_written_and_the_table_holds_every_entrant(rows, tmp_path):
+def test_all_files_are_written_and_the_table_holds_every_entrant(rows, tmp_path):
     quality.write(tmp_path / "out", rows)
     text = (tmp_path / "out/leaderboard.md").read_text()
     for name in ENTRANTS:
@@ -74,6 +74,7 @@ def test_all_three_files_are_written_and_the_table_holds_every_entrant(rows, tmp
     assert [row["entrant"] for row in read] == [row["entrant"] for row in rows]
     assert float(read[0]["auroc"]) == pytest.approx(rows[0]["auroc"], rel=1e-5)
     assert (tmp_path / "out/leaderboard.png").read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in (tmp_path / "out/leaderboard.svg").read_bytes()
 
 
 def test_a_set_with_one_class_gets_no_invented_number(rows):

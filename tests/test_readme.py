@@ -1,4 +1,4 @@
-"""The README's code runs as printed."""
+"""README, guide and numbers: their code runs as printed, their links and commands exist."""
 
 import re
 from pathlib import Path
@@ -7,12 +7,33 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import loop, motions
+from jaxtyping import Array, Float
 
 import taojax
+from benchmarks import __main__ as benchmarks
+from taojax.audit import calibration
+from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
 from taojax.cli import main
+from taojax.runtime.rivals import SYSTEMS
+from taojax.specs import column_names
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+ROOT = Path(__file__).parents[1]
+PAGES = ("README.md", "benchmarks/README.md", "notebooks/README.md", "data_specs/README.md")
+TEXT = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
+README, GUIDE = TEXT["README.md"], TEXT["notebooks/README.md"]
+
+
+def blocks(text):
+    found = re.findall(r"^( *)```python\n(.*?)^\1```", text, flags=re.S | re.M)
+    return [re.sub(f"^{indent}", "", block, flags=re.M) for indent, block in found]
+
+
+BLOCKS = blocks(README)
+
+
+def block(start):
+    (found,) = [text for text in blocks(GUIDE) if text.startswith(start)]
+    return found
 
 
 def test_bring_your_own_data_runs_as_printed(rng, tmp_path, monkeypatch):
@@ -43,11 +64,78 @@ def test_the_robot_program_runs_as_printed(rng):
     assert taojax.STATUSES[int(names["record"].status)] == "warming_up"
 
 
-def test_every_verb_of_the_readme_exists(capsys):
-    verbs = set(re.findall(r"`taojax ([a-z]+)\b", README))
+def test_every_verb_of_the_pages_exists(capsys):
+    verbs = set(re.findall(r"`taojax ([a-z]+)\b", "\n".join(TEXT.values())))
     assert verbs >= {"audit", "score", "evaluate", "kidnap", "sweep", "convert", "inspect"}
     for verb in verbs:
         with pytest.raises(SystemExit) as stop:
             main([verb, "--help"])
         assert not stop.value.code
     capsys.readouterr()
+
+
+def test_every_benchmark_of_the_pages_exists(capsys):
+    verbs = set(re.findall(r"python -m benchmarks ([a-z_]+)", "\n".join(TEXT.values())))
+    assert verbs >= {"quality", "ablation", "progress", "speed", "reliability", "gallery"}
+    for verb in verbs:
+        with pytest.raises(SystemExit) as stop:
+            benchmarks.main([verb, "--help"])
+        assert not stop.value.code
+    capsys.readouterr()
+
+
+def slugs(text):
+    heads = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_to_a_file_and_a_heading(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", TEXT[page]):
+        name, _, head = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
+        assert path.exists(), target
+        if head:
+            assert head in slugs(path.read_text(encoding="utf-8")), target
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_file_of_the_project_that_a_page_names_exists(page):
+    named = set(re.findall(r"`((?:taojax|benchmarks|tests|data_specs)/[\w/]+\.\w+)`", TEXT[page]))
+    missing = {name for name in named if not (ROOT / name).exists()}
+    assert missing <= {"taojax/baselines/nearest.py"}  # the guide has the reader write it
+
+
+def test_readme_and_guide_stay_short():
+    assert len(README.split()) <= 2500
+    assert len(GUIDE.split()) <= 2500
+
+
+def test_pictures_are_small_and_shown_somewhere():
+    for picture in (ROOT / ".github/pictures").iterdir():
+        assert picture.stat().st_size < 600_000
+        assert any(picture.name in text for text in TEXT.values()), picture.name
+
+
+def test_the_signal_of_the_guide_is_one_and_goes_where_the_guide_says():
+    names = {"Float": Float, "Array": Array, "jnp": jnp}
+    exec(block("def contrast"), names)
+    stands_out, flat = jnp.array([0.9, 0.1, 0.1]), jnp.array([0.5, 0.5, 0.5])
+    assert float(names["contrast"](stands_out)) < float(names["contrast"](flat)) <= 0.0
+    assert "margin" in column_names("signals")
+    assert '"margin": signals.margin(similarity),' in (ROOT / "taojax/runtime/stream.py").read_text(
+        encoding="utf-8"
+    )
+    assert calibration.BLURRED.keys() == calibration.DISTINCT.keys()
+
+
+def test_the_baseline_of_the_guide_is_a_rival(rng):
+    names = {"Frames": Frames, "Track": Track, "clean": clean, "np": np}
+    names["track_of_nodes"] = track_of_nodes
+    exec(block("def nearest"), names)
+    rows = rng.random((4, 6)).astype(np.float32)
+    index = np.argsort(-rows, axis=1).astype(np.int32)
+    best = np.take_along_axis(rows, index, axis=1)
+    track = names["nearest"](Frames(loop(6), np.zeros((4, 3)), rows, index, best))
+    np.testing.assert_allclose(track.signal, 1.0 - rows.max(axis=1), atol=1e-6)
+    assert "nearest" not in SYSTEMS
