@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from taojax.errors import GateError, TaojaxError
+from taojax.errors import GateError, TaojaxError, UsageError
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where real recordings lie when `--data` does not say: beside the checkout."""
@@ -50,6 +50,16 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _reliability(out: Path, *, quick: bool, only: str) -> int:
+    from benchmarks import reliability
+
+    try:
+        return 1 if reliability.run(out, quick=quick, only=only) else 0
+    except UsageError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     args = _parser().parse_args(arguments)
@@ -86,9 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(error, file=sys.stderr)
             return 5 if isinstance(error, GateError) else 3
     elif args.verb == "reliability":
-        from benchmarks import reliability
-
-        return 1 if reliability.run(out, quick=args.quick, only=args.only) else 0
+        return _reliability(out, quick=args.quick, only=args.only)
     else:
         from benchmarks import quality
 

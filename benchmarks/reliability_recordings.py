@@ -84,7 +84,9 @@ def _named(folder: Path) -> None:
 def _plain(folder: Path, out: Path) -> list[np.ndarray]:
     from taojax.datasets.plain import read_plain
 
-    return [array for session in read_plain(folder) for array in session.poses]
+    return [
+        array for session in read_plain(folder) if session is not None for array in session.poses
+    ]
 
 
 def _drive_files(folder: Path) -> None:

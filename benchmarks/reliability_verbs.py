@@ -4,6 +4,7 @@ import contextlib
 import functools
 import io
 import json
+import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -86,6 +87,44 @@ def _evaluate(folder: Path, out: Path, *, reseals: bool = False) -> list[np.ndar
     return []
 
 
+def _judged(folder: Path) -> None:
+    _sealed(folder)
+    command(["evaluate", folder / "run", "--truth", folder / "data/truth"])
+    shutil.copytree(folder / "run", folder / "other")
+
+
+def _closures(folder: Path, out: Path) -> list[np.ndarray]:
+    command(["closures", folder / "run", "--out", out])
+    return []
+
+
+def _compare(folder: Path, out: Path) -> list[np.ndarray]:
+    command(["compare", folder / "run", folder / "other", "--out", out])
+    return []
+
+
+def _explain(folder: Path, out: Path) -> list[np.ndarray]:
+    command(["explain", folder / "run", "--frame", "5", "--no-progress", "--out", out])
+    return []
+
+
+def _rerun(folder: Path, out: Path) -> list[np.ndarray]:
+    command(["rerun", folder / "run", "--data", folder / "data", "--no-progress", "--out", out])
+    return []
+
+
+def _swept(folder: Path) -> None:
+    write_data(folder)
+    (folder / "grid.toml").write_text("[rank]\nlambda_velocity = [0.1, 1]\nwindow = [3]\n")
+
+
+def _sweep(folder: Path, out: Path) -> list[np.ndarray]:
+    grid = ["--grid", folder / "grid.toml", "--branches", "4"]
+    command(["sweep", folder, *grid, "--no-judge", "--no-progress", "--out", out])
+    with np.load(out / "signals.npz") as sealed:
+        return [sealed["tao"]]
+
+
 def reseal(run: Path) -> None:
     """Make a changed run look sealed, as a forger would."""
     from taojax.records import SEALED, digest_file, seal_of
@@ -103,6 +142,7 @@ RUN = (
     "run/retrievals.npz",
     "run/signals.csv",
 )
+JUDGED = ("run/verdicts.csv", "run/labels.csv")
 TRUTH = ("data/truth/query_poses.csv",)
 
 
@@ -131,6 +171,11 @@ def _verbs() -> list[Target]:
             functools.partial(_evaluate, reseals=True),
             0.05,
         ),
+        Target("closures", _judged, (*RUN, "run/odometry.csv", *JUDGED), _closures, 0.1),
+        Target("compare", _judged, (*RUN, *JUDGED, "run/audit.json"), _compare, 0.05),
+        Target("explain", _judged, (*RUN, "run/odometry.csv", *JUDGED), _explain, 0.05),
+        Target("rerun", _sealed, (*RUN, "data/map/poses.csv"), _rerun, 0.05),
+        Target("sweep", _swept, (*DATA, *VIEWS, "grid.toml"), _sweep, 0.05),
     ]
 
 

@@ -5,8 +5,6 @@ import hashlib
 import io
 import json
 import os
-import secrets
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,10 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taojax.errors import InputError
-from taojax.specs import load_spec, read_bytes, read_npz, write_atomically
+from taojax.parts import locked_part
+from taojax.specs import fail, load_spec, open_file, read_bytes, read_npz, write_atomically
 from taojax.tables import read_table, table_text
 
 SCHEMA = 1
+
+INPUTS = "inputs/"
+"""Before the names of sensor files in a manifest."""
 SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
 """Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
 
@@ -81,16 +83,22 @@ def digest_file(path: Path) -> str:
     """Return the SHA-256 of a file, hex, without holding it in memory.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: missing, no regular file, or unreadable.
     """
-    if path.exists() and not path.is_file():
-        # A pipe or a device may never end.
-        raise InputError(f"{path}: is not a file; store the file itself")
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
+    with open_file(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def input_hashes(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Return file below the data folder -> SHA-256 of everything that a run was made from."""
+    hashes = manifest["sha256"].items()
+    return {n.removeprefix(INPUTS): h for n, h in hashes if n.startswith(INPUTS)}
+
+
+def code_digest() -> str:
+    """Return the SHA-256 of the sources of this package, hex."""
+    package = Path(__file__).parent
+    return digest(b"".join(path.read_bytes() for path in sorted(package.rglob("*.py"))))
 
 
 def seal_of(manifest: Mapping[str, Any]) -> str:
@@ -99,14 +107,26 @@ def seal_of(manifest: Mapping[str, Any]) -> str:
     return digest(json.dumps(body, sort_keys=True).encode())
 
 
-def refuse_if_taken(out: Path) -> None:
-    """Check that a run may be written to `out`.
-
-    Raises:
-        InputError: `out` is a file or already holds something.
-    """
+def _refuse_if_held(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise InputError(f"{out}: already holds files; choose a new --out")
+
+
+def refuse_if_taken(out: Path) -> None:
+    """Check, before the work of minutes, that a run may be written to `out`.
+
+    Raises:
+        InputError: `out` is a file, already holds something, or could not be written.
+    """
+    try:
+        _refuse_if_held(out)
+        first = out / "run"
+        while not first.parent.exists():
+            first = first.parent
+        with locked_part(first, is_folder=True):
+            pass
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another") from error
 
 
 def publish(out: Path, files: Mapping[str, bytes]) -> None:
@@ -119,21 +139,19 @@ def publish(out: Path, files: Mapping[str, bytes]) -> None:
     Raises:
         InputError: `out` is taken (also by a process that was quicker), or cannot be written.
     """
-    refuse_if_taken(out)
-    part = out.with_name(f".{out.name}.{secrets.token_hex(6)}.part")
+    _refuse_if_held(out)
     try:
-        for name, raw in files.items():
-            write_atomically(part / name, raw)
-        # Renaming onto an empty folder is allowed, onto a filled one it fails: one writer wins.
-        part.rename(out)
+        with locked_part(out, is_folder=True) as part:
+            for name, raw in files.items():
+                write_atomically(part / name, raw)
+            # Renaming onto an empty folder is allowed, onto a filled one it fails: one writer wins.
+            part.rename(out)
         folder = os.open(out.parent, os.O_RDONLY)
         os.fsync(folder)
         os.close(folder)
     except OSError as error:
-        refuse_if_taken(out)
+        _refuse_if_held(out)
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _archive(**arrays: np.ndarray) -> bytes:
@@ -210,7 +228,7 @@ def read_manifest(run: Path) -> dict[str, Any]:
     """Return a run's manifest after checking its own seal.
 
     Raises:
-        InputError: missing, not JSON, of another schema, or edited since.
+        InputError: missing, not JSON, of another schema, edited since, or of several scenarios.
     """
     path = run / "manifest.json"
     fix = "score the data set again"
@@ -218,6 +236,8 @@ def read_manifest(run: Path) -> dict[str, Any]:
         manifest = json.loads(read_bytes(path))
     except ValueError as error:
         raise InputError(f"{path}: is not JSON; {fix}") from error
+    if isinstance(manifest, dict) and "scenarios" in manifest:
+        raise fail(run, "holds several scenarios", f"name one of them, such as {run}/default")
     if not isinstance(manifest, dict) or not isinstance(manifest.get("sha256"), dict):
         raise InputError(f"{path}: is not the manifest of a run; {fix}")
     if manifest.get("schema") != SCHEMA:

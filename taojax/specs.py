@@ -4,22 +4,23 @@ A spec names the columns of a CSV with unit and legal range, or the axes of an a
 and writers take the column order from it, so a file and its documentation cannot part ways.
 """
 
+import contextlib
 import functools
 import io
 import lzma
 import os
-import secrets
 import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from taojax.errors import InputError
+from taojax.parts import locked_part
 
 MAX_BYTES = 8 << 30
 """Largest array file that is opened, bytes; guards against bombs inside npz archives."""
@@ -60,22 +61,34 @@ def first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:80]
 
 
+@contextlib.contextmanager
+def open_file(path: Path) -> Iterator[io.BufferedReader]:
+    """Open a regular file for reading its bytes.
+
+    Raises:
+        InputError: missing, a folder, a pipe or device, or unreadable, also while it is read.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            # A pipe or a device may never end.
+            kind = "a folder" if path.is_dir() else "a pipe or device"
+            raise fail(path, f"cannot be read (is {kind})", "point at a file")
+        with path.open("rb") as stream:
+            yield stream
+    except FileNotFoundError as error:
+        raise fail(path, "no such file", "add it or point at another folder") from error
+    except OSError as error:
+        raise fail(path, f"cannot be read ({error.strerror})", "check the file") from error
+
+
 def read_bytes(path: Path) -> bytes:
     """Return a file's bytes.
 
     Raises:
         InputError: missing, no regular file, or unreadable.
     """
-    if path.exists() and not path.is_file():
-        # A pipe or a device may never end.
-        kind = "a folder" if path.is_dir() else "a pipe or device"
-        raise fail(path, f"cannot be read (is {kind})", "point at a file")
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise fail(path, "no such file", "add it or point at another folder") from error
-    except OSError as error:
-        raise fail(path, f"cannot be read ({error.strerror})", "check the file") from error
+    with open_file(path) as stream:
+        return stream.read()
 
 
 def read_text(path: Path) -> str:
@@ -159,14 +172,12 @@ def write_atomically(path: Path, data: bytes | str) -> None:
         InputError: the folder is read-only or the disk is full.
     """
     raw = data.encode() if isinstance(data, str) else data
-    part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as stream:
-            stream.write(raw)
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
+        with locked_part(path, is_folder=False) as part:
+            with part.open("wb") as stream:
+                stream.write(raw)
+                stream.flush()
+                os.fsync(stream.fileno())
+            part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise fail(path, f"cannot be written ({error.strerror})", "choose another --out") from error

@@ -2,6 +2,7 @@
 
 import csv
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from taojax.baselines.paper_cost import numpy_cost, svd_cost
 from taojax.cli import main
 from taojax.core.cost import Branch, branch_cost
 from taojax.errors import GateError, InputError
-from taojax.runtime import bench
+from taojax.runtime import bench, bench_fresh
 
 
 def test_the_papers_formulation_is_the_cost_that_is_timed_against_it(rng):
@@ -22,10 +23,10 @@ def test_the_papers_formulation_is_the_cost_that_is_timed_against_it(rng):
     single = (jnp.asarray(a, jnp.float32) for a in (p, q, s))
     single = (*single, jnp.asarray(has))
     np.testing.assert_allclose(svd_cost(bench.WINDOW_PARAMS, *single)[2:], want[2:], rtol=2e-3)
-    for k in range(2, 50):
-        branch = Branch(single[1][k], single[2][k], single[3][k])
-        got = branch_cost(bench.WINDOW_PARAMS, single[0], branch, jnp.full(20, 0.05)).total
-        np.testing.assert_allclose(got, want[k], rtol=2e-3)
+    branches = Branch(jnp.swapaxes(single[1], 0, 1), single[2].T, single[3].T)
+    cost = jax.jit(branch_cost, static_argnums=0)
+    got = cost(bench.WINDOW_PARAMS, single[0], branches, jnp.full(20, 0.05)).total
+    np.testing.assert_allclose(got[2:], want[2:], rtol=2e-3)
 
 
 ROWS = [bench.Row("numpy_over_step_rank", 5.0, "x"), bench.Row("step_rank_p50_us", 400.0, "us")]
@@ -87,3 +88,19 @@ def test_retrieval_is_timed_beside_reading_the_same_memory():
     of_bandwidth = rows["read_us"].value / rows["retrieval_us"].value
     assert rows["retrieval_of_bandwidth"].value == pytest.approx(of_bandwidth)
     assert rows["retrieval_us"].value > 0
+
+
+def test_importing_the_package_takes_less_than_importing_the_step(monkeypatch):
+    monkeypatch.setattr(bench_fresh, "N_IMPORTS", 1)
+    rows = {row.name: row for row in bench_fresh.imports()}
+    assert 0.0 < rows["import_taojax_s"].value < rows["import_step_s"].value
+    assert {row.unit for row in rows.values()} == {"s"}
+
+
+def test_the_installed_size_counts_what_is_needed_and_no_extras():
+    assert {"jax", "jaxlib", "numpy", "scipy"} <= bench_fresh.needed()
+    assert not {"pytest", "ruff", "rosbags", "flatbuffers"} & bench_fresh.needed()
+    own, whole = bench_fresh.installed()
+    assert (own.name, whole.name) == ("installed_mb", "installed_with_dependencies_mb")
+    assert 0.3 < own.value < 20.0
+    assert whole.value > 100.0

@@ -5,16 +5,17 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import __main__
 from benchmarks import reliability_faults as faults
 from taojax import cli
 from taojax.errors import InputError
-from taojax.records import read_run
+from taojax.records import read_run, refuse_if_taken
 
 
 def test_a_killed_writer_leaves_whole_runs_only():
     found = faults.kills_while_sealing(3)
     assert found["sealing: half sealed"] == 0
-    assert found["sealing: whole runs"] > 0
+    assert found["sealing: whole runs"] >= found["sealing: kills"] == 3
 
 
 def test_a_sealed_run_reads_and_is_never_written_twice(tmp_path):
@@ -55,3 +56,28 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys):
     code, lines = score(data, Path("/proc/nowhere"), capsys)
     assert (code, len(lines)) == (3, 1)
     assert "cannot be written" in lines[0]
+
+
+@pytest.mark.parametrize("out", ["/proc/nowhere", "/proc/a/b", "{}/file/run", "{}/" + "x" * 300])
+def test_an_out_that_cannot_be_written_is_known_before_the_work(out, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="cannot be written"):
+        refuse_if_taken(Path(out.format(tmp_path)))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_asking_whether_an_out_is_free_leaves_nothing(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "new", "a/b/c"):
+        refuse_if_taken(tmp_path / name)
+    assert [path.name for path in tmp_path.rglob("*")] == ["empty"]
+
+
+@pytest.mark.parametrize("only", ["nonsense", "faults,nonsense", "faults,"])
+def test_a_section_that_there_is_not_is_one_line_of_usage(only, tmp_path, capsys):
+    assert __main__.main(["reliability", "--only", only, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert "fuzz, numbers, faults, stream" in said.err
+    assert not (tmp_path / "out").exists()

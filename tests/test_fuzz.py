@@ -14,6 +14,7 @@ from benchmarks.reliability_recordings import recordings
 from benchmarks.reliability_targets import own_files, tables
 from taojax.datasets.odometry import read_odometry
 from taojax.errors import InputError
+from taojax.records import digest_file
 from taojax.specs import read_bytes, read_npy, read_npz
 from taojax.tables import read_table
 
@@ -96,8 +97,9 @@ def test_what_never_ends_is_not_read(tmp_path, kind):
         path.symlink_to("/dev/zero")
     else:
         path.mkdir()
-    with pytest.raises(InputError, match="cannot be read"):
-        read_bytes(path)
+    for read in (read_bytes, digest_file):
+        with pytest.raises(InputError, match="cannot be read"):
+            read(path)
     if kind != "folder":
         with pytest.raises(InputError, match="pipe or device"):
             read_odometry(path, "bag")

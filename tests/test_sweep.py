@@ -13,8 +13,9 @@ from taojax.audit.labels import split_frames
 from taojax.config import Config, StreamConfig
 from taojax.errors import ConfigError
 from taojax.runtime import grid as grids
+from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
-from taojax.runtime.stream import Frame, replay
+from taojax.runtime.stream import replay
 from taojax.runtime.sweep import evaluate, plan
 
 GRID = """

@@ -13,7 +13,7 @@ from taojax.audit import figures, metrics, tables
 from taojax.audit.compare import SIGNALS, Comparison, Judged, Scope
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.plots import INK, PALE
-from taojax.records import publish
+from taojax.records import input_hashes, publish
 from taojax.specs import load_spec
 
 FEW_EXCURSIONS = 10
@@ -47,11 +47,6 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _inputs(run: Judged) -> dict[str, Any]:
-    hashes = run.manifest["sha256"]
-    return {n.removeprefix("inputs/"): h for n, h in hashes.items() if n.startswith("inputs/")}
-
-
 def _differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     return sorted(key for key in {*one, *other} if one.get(key) != other.get(key))
 
@@ -65,7 +60,8 @@ def _causes(run: Judged, reference: Judged) -> str:
         f"{key} {ours.get(key, 'unset')} against {theirs.get(key, 'unset')}"
         for key in _differing(ours, theirs)
     ]
-    parts += [f"other {name}" for name in _differing(_inputs(run), _inputs(reference))]
+    inputs = (input_hashes(run.manifest), input_hashes(reference.manifest))
+    parts += [f"other {name}" for name in _differing(*inputs)]
     facts = ("code", "device", "versions")
     changed = [key for key in facts if run.manifest.get(key) != reference.manifest.get(key)]
     parts += [f"other {key}" for key in changed]

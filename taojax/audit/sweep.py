@@ -14,7 +14,7 @@ from taojax.audit.sweep_figures import NO_SETTING, draw, varied
 from taojax.audit.truth import read_truth
 from taojax.config import Config
 from taojax.errors import InputError
-from taojax.records import digest_file, read_manifest
+from taojax.records import INPUTS, digest_file, read_manifest
 from taojax.specs import column_names, read_npz, write_atomically
 from taojax.tables import read_table, table_text
 from taojax.verdicts import plain
@@ -50,7 +50,7 @@ def read_sweep(run: Path) -> SealedSweep:
     """
     manifest = read_manifest(run)
     for name, want in manifest["sha256"].items():
-        if not name.startswith("inputs/") and digest_file(run / name) != want:
+        if not name.startswith(INPUTS) and digest_file(run / name) != want:
             raise InputError(f"{run / name}: seal broken, it was changed; sweep again")
     poses = read_table(run / "map_poses.csv", "map_poses")
     grid = read_table(run / "grid.csv", "grid")

@@ -8,16 +8,11 @@ import csv
 import gc
 import importlib.util
 import os
-import resource
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +25,12 @@ from taojax.baselines.topometric import topometric
 from taojax.config import StreamConfig
 from taojax.core.cost import Branch, CostParams, branch_cost
 from taojax.errors import GateError, InputError
+from taojax.runtime.bench_fresh import first_steps, imports, installed
+from taojax.runtime.bench_rows import Row, best_us, peak_mb
+from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.retrieval import normalise, prepare, top_k
-from taojax.runtime.stream import Frame, init, replay, step
+from taojax.runtime.stream import init, replay, step
 
 K, N = 100, 20
 """Branches and window of the paper's headline."""
@@ -41,29 +39,6 @@ MAP_SHAPE = 2000, 8448
 """Places and width of the descriptors, as a SALAD map has them."""
 
 WINDOW_PARAMS = CostParams(1.0, 1.0, 112.5, 5.0, 15.0)
-
-FIRST_STEP = """
-import time, numpy as np, jax, jax.numpy as jnp
-from taojax.config import StreamConfig
-from taojax.runtime.maps import map_tables
-from taojax.runtime.stream import Frame, init, step
-a = np.linspace(0, 6, 2000)
-config = StreamConfig()
-tables = map_tables(np.stack([300 * np.cos(a), 200 * np.sin(a), a], 1), config)
-frame = Frame(jnp.zeros(3), jnp.arange(100, dtype=jnp.int32), jnp.zeros(100))
-state = jax.block_until_ready(init(config, tables))
-began = time.perf_counter()
-jax.block_until_ready(step(config, tables, state, frame))
-print(time.perf_counter() - began)
-"""
-
-
-class Row(NamedTuple):
-    """One figure of bench.csv."""
-
-    name: str
-    value: float
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -87,24 +62,6 @@ class Drive:
             self.index[:n_frames],
             self.similarity[:n_frames],
         )
-
-
-def best_us(work: Callable[[], object], repeats: int, per: int = 1) -> float:
-    """Return the microseconds of the fastest repeat, divided by `per`; the first call is free."""
-    jax.block_until_ready(work())
-    best = float("inf")
-    for _ in range(repeats):
-        began = time.perf_counter()
-        jax.block_until_ready(work())
-        best = min(best, time.perf_counter() - began)
-    return best / per * 1e6
-
-
-def peak_mb() -> float:
-    """Return the most memory that this process ever held."""
-    # Kilobytes on Linux, bytes on macOS.
-    unit = 1.0 if sys.platform == "darwin" else 1e3
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def random_windows(rng: np.random.Generator, k: int, n: int) -> tuple[np.ndarray, ...]:
@@ -219,22 +176,6 @@ def retrieval(n_places: int, width: int, repeats: int) -> list[Row]:
     return rows
 
 
-def _first_steps() -> list[Row]:
-    """Time the very first step in fresh interpreters: nothing cached, then everything cached."""
-    rows = []
-    with tempfile.TemporaryDirectory() as cache:
-        known = os.environ | {
-            "JAX_COMPILATION_CACHE_DIR": cache,
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }
-        for name in ("first_step_cold_s", "first_step_cached_s"):
-            done = subprocess.run(
-                [sys.executable, "-c", FIRST_STEP], env=known, capture_output=True, check=True
-            )
-            rows.append(Row(name, float(done.stdout.split()[-1]), "s"))
-    return rows
-
-
 def _ratios(rows: Sequence[Row]) -> list[Row]:
     """Return what counts, larger = better."""
     at = {row.name: row.value for row in rows}
@@ -271,9 +212,9 @@ def measure(drive: Drive, *, quick: bool, say: Callable[[str], None]) -> list[Ro
     rows += retrieval(*MAP_SHAPE, 3 * repeats)
     rows += _ratios(rows)
     if not quick:
-        say("first step in a fresh interpreter")
-        rows += _first_steps()
-    return [*rows, Row("peak_memory_mb", peak_mb(), "MB")]
+        say("imports and first step in a fresh interpreter")
+        rows += [*imports(), *first_steps()]
+    return [*rows, *installed(), Row("peak_memory_mb", peak_mb(), "MB")]
 
 
 def write_rows(rows: Sequence[Row], path: Path) -> None:

@@ -15,7 +15,7 @@ from taojax.config import Config, replace, to_toml
 from taojax.detector import Detector, MapFacts, foreign_map
 from taojax.detector import to_toml as detector_toml
 from taojax.errors import InputError
-from taojax.records import digest, refuse_if_taken, write_run
+from taojax.records import code_digest, refuse_if_taken, write_run
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
@@ -101,8 +101,6 @@ def signal_table(t_s: np.ndarray, records: StreamRecord) -> dict[str, np.ndarray
 
 def facts_of(command: str, dataset: Path, seed: int) -> dict[str, Any]:
     """Return what the manifest says of this machine and code."""
-    package = Path(__file__).parents[1]
-    sources = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
     names = ("jax", "jaxlib", "equinox", "optimistix", "numpy")
     return {
         "command": command,
@@ -113,7 +111,7 @@ def facts_of(command: str, dataset: Path, seed: int) -> dict[str, Any]:
             "taojax": __version__,
             **{name: metadata.version(name) for name in names},
         },
-        "code": digest(sources),
+        "code": code_digest(),
         "device": jax.devices()[0].device_kind,
     }
 

@@ -20,9 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 from taojax.config import StreamConfig
 from taojax.core.cost import Branch, branch_cost
 from taojax.core.se2 import inverse, transform
+from taojax.runtime.frames import Frame
 from taojax.runtime.grid import Row, largest
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.stream import Frame, Memory, cost_params, init_memory, memory_step
+from taojax.runtime.stream import Memory, cost_params, init_memory, memory_step
 
 MOST_AT_ONCE = 32
 """Units under one `vmap` at most, where vmap is used at all."""

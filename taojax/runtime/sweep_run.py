@@ -17,10 +17,10 @@ from taojax.config import Config, to_toml
 from taojax.errors import InputError
 from taojax.records import SCHEMA, digest, read_manifest, refuse_if_taken, seal_of
 from taojax.runtime import grid as grids
+from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.observations import load_observations
 from taojax.runtime.score import candidates, facts_of
-from taojax.runtime.stream import Frame
 from taojax.runtime.sweep import at_once, evaluate, plan
 from taojax.specs import write_atomically
 from taojax.tables import table_text

@@ -1,6 +1,7 @@
 """`taojax audit`: the main job."""
 
 import dataclasses
+import shutil
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,8 +18,10 @@ from taojax.verbs.common import (
     out_of,
     say,
     score_apart,
+    told,
 )
 from taojax.verbs.layout import check_layout
+from taojax.verbs.resume import claimed, is_sealed
 
 if TYPE_CHECKING:
     from taojax.config import Config
@@ -60,18 +63,22 @@ def run(args: Audit) -> None:
         check_layout(args.dataset, has_truth=True)
     config = config_of(args)
     out = out_of(args, "audit", config)
-    if args.dataset is not None and args.simulate_views:
-        _audit_converted(args.dataset, args.map, out, config, progress=args.progress)
-    elif args.dataset is not None:
+    if args.dataset is not None and not args.simulate_views:
         _audit_folder(args.dataset, out, config, progress=args.progress)
-    else:
-        _audit_world(args.scenario, out, config, progress=args.progress)
+        return
+    with claimed(out, told(args, config)):
+        if args.dataset is not None:
+            _audit_converted(args.dataset, args.map, out, config, progress=args.progress)
+        else:
+            _audit_world(args.scenario, out, config, progress=args.progress)
 
 
 def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool) -> None:
     from taojax.records import refuse_if_taken
 
-    refuse_if_taken(out)
+    # The report is written last: a sealed run without one was stopped while it was judged.
+    if (out / "report.html").exists() or not is_sealed(out, dataset, config):
+        refuse_if_taken(out)
     score_apart(dataset, out, config, progress=progress)
     _judge(dataset, out, config)
 
@@ -80,18 +87,20 @@ def _audit_converted(
     dataset: Path, mapped: Path | None, out: Path, config: "Config", *, progress: bool
 ) -> None:
     """Complete a plain folder by simulation in out/data, then audit that."""
-    from taojax.records import refuse_if_taken
     from taojax.verbs.convert import make
     from taojax.verbs.convert_flags import Folder
 
-    refuse_if_taken(out)
     data, scored = out / "data", out / "scored"
-    make(Folder(folder=dataset, out=data, map=mapped, simulate_views=True, seed=config.seed))
-    score_apart(data, scored, config, progress=progress)
-    # A run is published into an empty folder alone, and this one holds its data already.
-    for path in sorted(scored.iterdir(), key=lambda path: path.name == "manifest.json"):
-        path.rename(out / path.name)
-    scored.rmdir()
+    if not data.exists():
+        make(Folder(folder=dataset, out=data, map=mapped, simulate_views=True, seed=config.seed))
+    if not is_sealed(out, data, config):
+        if not is_sealed(scored, data, config):
+            shutil.rmtree(scored, ignore_errors=True)
+        score_apart(data, scored, config, progress=progress)
+        # A run is published into an empty folder alone, and this one holds its data already.
+        for path in sorted(scored.iterdir(), key=lambda path: path.name == "manifest.json"):
+            path.rename(out / path.name)
+        scored.rmdir()
     _judge(data, out, config)
 
 
@@ -111,14 +120,14 @@ def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress
     from taojax.datasets.edit import scenario
     from taojax.datasets.simulate import WorldConfig, make_world
     from taojax.datasets.world import write_world
-    from taojax.records import refuse_if_taken
 
-    refuse_if_taken(out)
     say("simulating the KAIST-like world")
     world = make_world(WorldConfig(), config.seed)
     evaluations = {}
     for name in (only,) if only else SCENARIOS:
         folder = out / "data" / name
+        # Half of it may lie there from a command that was stopped.
+        shutil.rmtree(folder, ignore_errors=True)
         write_world(scenario(world, name), folder)
         say(f"scoring scenario {name} (simulated)")
         score_apart(folder, out / name, config, progress=progress)

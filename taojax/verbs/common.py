@@ -13,6 +13,7 @@ import tyro
 
 from taojax.errors import ConfigError, UsageError
 from taojax.verbs import child
+from taojax.verbs.resume import is_sealed
 
 if TYPE_CHECKING:
     from taojax.config import Config
@@ -83,6 +84,13 @@ def config_of(args: Common, base: Path | None = None) -> "Config":
         raise UsageError(f"flag {error}") from error
 
 
+def told(args: Common, config: "Config") -> str:
+    """Return all that decides what a command makes, to know it again."""
+    from taojax.config import to_toml
+
+    return f"{dataclasses.replace(args, out=None, progress=True)!r}\n{to_toml(config)}"
+
+
 def out_of(args: Common, verb: str, config: "Config") -> Path:
     """Return the folder of this run."""
     from taojax.config import to_toml
@@ -98,9 +106,15 @@ def out_of(args: Common, verb: str, config: "Config") -> Path:
 def score_apart(
     dataset: Path, out: Path, config: "Config", *, progress: bool, flags: Sequence[str] = ()
 ) -> None:
-    """Score in a fresh interpreter: one in which the judge has never been imported."""
+    """Score in a fresh interpreter: one in which the judge has never been imported.
+
+    A run that is sealed already, of the same data, settings and code, is kept as it is.
+    """
     from taojax.config import to_toml
 
+    if is_sealed(out, dataset, config):
+        say(f"{out} is sealed already; going on")
+        return
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "config.toml"
         path.write_text(to_toml(config), encoding="utf-8")

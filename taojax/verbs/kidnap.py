@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import tyro
 
 from taojax.errors import InputError, UsageError
-from taojax.verbs.common import Common, config_of, flag, out_of, say, score_apart
+from taojax.verbs.common import Common, config_of, flag, out_of, say, score_apart, told
+from taojax.verbs.resume import claimed
 
 if TYPE_CHECKING:
     from taojax.audit.recovery_data import Part
@@ -83,9 +84,12 @@ def run(args: Kidnap) -> None:
         raise UsageError("--trials and --worlds count from 1, --rival-trials from 0, --basin > 0")
     config = config_of(args)
     out = out_of(args, "kidnap", config)
-    from taojax.records import refuse_if_taken
+    with claimed(out, told(args, config)):
+        _carry(args, config, out)
 
-    refuse_if_taken(out)
+
+def _carry(args: Kidnap, config: "Config", out: Path) -> None:
+    """Fill a folder with logs, their sealed runs and what the judge makes of them."""
     jobs = _simulated(args, config, out) if args.dataset is None else _recorded(args, config, out)
     parts = _score_all(jobs, out, config, progress=args.progress)
     from taojax.audit.recovery_report import write_recovery

@@ -30,8 +30,6 @@ LATER = ("about.toml", "query/retrievals.npz")
 PLACE = ("dataset", "command")
 """Entries of a manifest that only say where the data lie."""
 
-INPUTS = "inputs/"
-
 
 @dataclasses.dataclass(frozen=True)
 class Rerun:
@@ -72,7 +70,7 @@ def run(args: Rerun) -> None:
     if args.out is not None:
         refuse_if_taken(args.out)
     data = args.data or _find(args.run, str(sealed.manifest.get("dataset", "")))
-    _check_inputs(data, sealed.manifest["sha256"])
+    _check_inputs(data, sealed.manifest)
     say(f"scoring {data} again")
     with tempfile.TemporaryDirectory() as scratch:
         out = args.out or Path(scratch) / "run"
@@ -118,13 +116,13 @@ def _find(run: Path, named: str) -> Path:
     raise InputError(f"{run}: {what}; name them with --data")
 
 
-def _check_inputs(data: Path, hashes: Mapping[str, str]) -> None:
+def _check_inputs(data: Path, manifest: Mapping[str, Any]) -> None:
     """Refuse data other than those that were sealed."""
-    from taojax.records import digest_file
+    from taojax.records import digest_file, input_hashes
 
     if not data.is_dir():
         raise InputError(f"{data}: no such data folder; name that of the run with --data")
-    inputs = {n.removeprefix(INPUTS): h for n, h in hashes.items() if n.startswith(INPUTS)}
+    inputs = input_hashes(manifest)
     for name, want in inputs.items():
         got = digest_file(data / name)
         if got != want:
@@ -163,6 +161,8 @@ def _compare(
     old: Path, new: Path, hashes: Mapping[str, str], again: Mapping[str, str]
 ) -> dict[str, Verdict]:
     """Compare every sealed file with the one made again."""
+    from taojax.records import INPUTS
+
     names = sorted(name for name in {*hashes, *again} if not name.startswith(INPUTS))
     verdicts = {}
     for name in names:

@@ -3,8 +3,6 @@
 import dataclasses
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from taojax.errors import InputError
+from taojax.verbs.child import start
 from taojax.verbs.common import Common, config_of, flag, out_of, say
 
 if TYPE_CHECKING:
@@ -113,11 +112,11 @@ def _compute_apart(
         words += ["--grid", str(values), "--no-judge"]
         words += ["--progress" if progress else "--no-progress"]
         # In a group of its own the child hears of an interrupt once, from here.
-        child = subprocess.Popen([sys.executable, "-m", "taojax", *words], process_group=0)
-        try:
-            code = child.wait()
-        except KeyboardInterrupt:
-            child.send_signal(signal.SIGINT)
-            code = child.wait()
+        with start(words, has_own_group=True) as child:
+            try:
+                code = child.wait()
+            except KeyboardInterrupt:
+                child.send_signal(signal.SIGINT)
+                code = child.wait()
     if code:
         raise SystemExit(code)
