@@ -37,8 +37,11 @@ while True:
 """
 
 
+LAST = ("report.html", "sweep.csv")
+"""Files that commands write last."""
+
 FINISHED = ("finished again", "was finished")
-"""What may come of a killed job. A folder that holds something sealed is never written again."""
+"""What may come of a killed job once it is repeated."""
 
 TOO_LATE = "done before the blow"
 
@@ -96,7 +99,8 @@ def _again(job: Job, data: Path, out: Path) -> Killed:
     """Run a job again after it was killed, and say what came of it."""
     begun = time.monotonic()
     code, said = finish(job.words(data, out))
-    if code == 3 and (out / "report.html").is_file() and "choose a new --out" in said[-1]:
+    is_whole = any((out / name).is_file() for name in LAST)
+    if code == 3 and is_whole and "choose a new --out" in said[-1]:
         # The blow fell between the last file and the end of the process.
         return Killed("was finished")
     if code:

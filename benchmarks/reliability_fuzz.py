@@ -1,6 +1,7 @@
 """Hostile files for every reader and verb; each case ends well or with one line."""
 
 import contextlib
+import math
 import multiprocessing
 import os
 import resource
@@ -48,7 +49,7 @@ class Case(NamedTuple):
 def plan(n_cases: int, chosen: Sequence[Target]) -> list[tuple[str, int]]:
     """Share cases among the targets: (target, number of the case)."""
     total = sum(target.share for target in chosen)
-    counts = [max(1, round(n_cases * target.share / total)) for target in chosen]
+    counts = [math.ceil(n_cases * target.share / total) for target in chosen]
     return [(t.name, at) for t, n in zip(chosen, counts, strict=True) for at in range(n)]
 
 
