@@ -9,7 +9,6 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
-from sklearn.neighbors import KDTree
 
 from taojax.baselines.frames import Frames, Track, clean
 from taojax.baselines.models import (
@@ -85,6 +84,9 @@ def _map_of(poses: Float[np.ndarray, "m 3"]) -> _Map:
     cell = (high - low) / _CELLS
     x, y = (low[i] + (np.arange(_CELLS) + 0.5) * cell[i] for i in range(2))
     centre = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    # Slow to import, and most runs ask for no rival.
+    from sklearn.neighbors import KDTree
+
     near = KDTree(xy).query(centre, k=min(_STORED, len(xy)), return_distance=False)
     return _Map(poses, near, low, cell, median_step_m(poses))
 

@@ -1,8 +1,6 @@
 """Sessions in, one data folder out: whole or not at all."""
 
 import json
-import secrets
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ from jaxtyping import Float, Int
 
 from taojax.datasets.trajectory import Trajectory
 from taojax.errors import InputError
+from taojax.parts import locked_part
 from taojax.tables import MOTION, POSE, table_text
 
 __all__ = ["Descriptors", "Lists", "Session", "stamped_text", "write_folder"]
@@ -90,34 +89,37 @@ def write_folder(
     """
     if out.exists():
         raise InputError(f"{out}: exists already; choose a new folder")
-    part = out.with_name(f".{out.name}.{secrets.token_hex(6)}.part")
     try:
-        for name in ("map", "query", *(("truth",) if truth is not None else ())):
-            (part / name).mkdir(parents=True)
-        origin, moved = _origin(mapped.xyt, truth)
-        files = {
-            "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
-            "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
-            "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n",
-        }
-        if truth is not None:
-            files["truth/query_poses.csv"] = stamped_text(
-                "query_poses", POSE, query[0], truth - origin
-            )
-        for name, text in files.items():
-            (part / name).write_text(text, encoding="utf-8")
-        if isinstance(views, Lists):
-            np.savez(part / "query/retrievals.npz", index=views.index, similarity=views.similarity)
-        else:
-            _copy_rows(views.map_rows, part / "map/descriptors.npy")
-            _copy_rows(views.query_rows, part / "query/descriptors.npy")
-        part.rename(out)
+        with locked_part(out, is_folder=True) as part:
+            for name in ("map", "query", *(("truth",) if truth is not None else ())):
+                (part / name).mkdir()
+            origin, moved = _origin(mapped.xyt, truth)
+            files = {
+                "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
+                "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
+                "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n",
+            }
+            if truth is not None:
+                files["truth/query_poses.csv"] = stamped_text(
+                    "query_poses", POSE, query[0], truth - origin
+                )
+            for name, text in files.items():
+                (part / name).write_text(text, encoding="utf-8")
+            _write_views(views, part)
+            part.rename(out)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); choose another folder"
         ) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_views(views: Descriptors | Lists, folder: Path) -> None:
+    if isinstance(views, Lists):
+        path = folder / "query/retrievals.npz"
+        np.savez(path, index=views.index, similarity=views.similarity)
+        return
+    _copy_rows(views.map_rows, folder / "map/descriptors.npy")
+    _copy_rows(views.query_rows, folder / "query/descriptors.npy")
 
 
 def stamped_text(spec: str, names: Sequence[str], t_s: np.ndarray, rows: np.ndarray) -> str:
