@@ -22,9 +22,8 @@ LIST_RECALL = 0.75
 """Recall of retrieval lists without map descriptors, and of a run that does not say: neither blind
 nor sure."""
 
-
-SAME_RECALL = 0.01
-"""Recalls nearer than this speak of the same descriptors."""
+MAP_VIEWS = ("map/descriptors.npy", "database_descriptors.npy")
+"""Names that the map's descriptors may have in a data folder."""
 
 
 class MapFacts(NamedTuple):
@@ -32,6 +31,9 @@ class MapFacts(NamedTuple):
 
     poses_sha256: str
     """Of map/poses.csv."""
+
+    views_sha256: str
+    """Of the map's descriptors; blank where the frontend gives lists."""
 
     spacing_m: float
     """Median distance between neighbours."""
@@ -63,6 +65,19 @@ class Detector(NamedTuple):
 
     fitted_on: MapFacts | None = None
     """None where the run did not say."""
+
+
+def map_of(hashes: Mapping[str, str], spacing_m: float, recall: float) -> MapFacts:
+    """Return which map some sealed inputs speak of.
+
+    Args:
+        hashes: `inputs/` and file below the data folder -> SHA-256.
+        spacing_m: of the map.
+        recall: of the map.
+    """
+    hashes = {name.removeprefix("inputs/"): value for name, value in hashes.items()}
+    seen = next((hashes[name] for name in MAP_VIEWS if name in hashes), "")
+    return MapFacts(hashes["map/poses.csv"], seen, spacing_m, recall)
 
 
 def log_odds_terms(
@@ -98,10 +113,10 @@ def foreign_map(detector: Detector, here: MapFacts) -> str | None:
     then = detector.fitted_on
     if then is None:
         return None
-    is_same = then.poses_sha256 == here.poses_sha256
-    if is_same and abs(then.recall - here.recall) <= SAME_RECALL:
+    if then[:2] == here[:2]:
         return None
-    what = "another map" if not is_same else "other descriptors of this map"
+    is_same = then.poses_sha256 == here.poses_sha256
+    what = "other descriptors of this map" if is_same else "another map"
     told = lambda facts: f"spacing {facts.spacing_m:.3g} m and recall {facts.recall:.2f}"
     return (
         f"the calibration was fitted on {what} ({told(then)}; here {told(here)}): how many wrong"
@@ -126,6 +141,7 @@ def to_toml(detector: Detector) -> str:
             "",
             "[map]",
             f'poses_sha256 = "{facts.poses_sha256}"',
+            f'views_sha256 = "{facts.views_sha256}"',
             f"spacing_m = {float(facts.spacing_m)!r}",
             f"recall = {float(facts.recall)!r}",
         ]
@@ -148,7 +164,10 @@ def from_toml(path: Path) -> Detector:
         fitted_on = None
         if seen is not None:
             fitted_on = MapFacts(
-                str(seen["poses_sha256"]), float(seen["spacing_m"]), float(seen["recall"])
+                str(seen["poses_sha256"]),
+                str(seen["views_sha256"]),
+                float(seen["spacing_m"]),
+                float(seen["recall"]),
             )
     except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise InputError(f"{path}: is not a calibration file ({error}); {fix}") from error

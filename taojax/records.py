@@ -64,6 +64,9 @@ class Run:
     manifest: dict[str, Any]
     """What was run, on what, with which code."""
 
+    decisions: dict[str, np.ndarray] | None = None
+    """Run-time verdicts, as in data_specs/decisions.toml; None where nobody decided."""
+
     tracks: dict[str, SealedTrack] | None = None
     """Rivals by name; None where they were not asked for."""
 
@@ -154,9 +157,11 @@ def publish(out: Path, files: Mapping[str, bytes]) -> None:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another") from error
 
 
-def _archive(**arrays: np.ndarray) -> bytes:
+def archive(**arrays: Any) -> bytes:
+    """Return arrays of numbers as a compressed npz file."""
     held = io.BytesIO()
-    np.savez_compressed(held, allow_pickle=False, **arrays)
+    # NumPy 2.0 would take a flag that forbids pickles for one more array.
+    np.savez_compressed(held, **arrays)
     return held.getvalue()
 
 
@@ -198,7 +203,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     files = {
         "config.toml": config_toml.encode(),
         "map_poses.csv": table_text("map_poses", map_poses).encode(),
-        "retrievals.npz": _archive(
+        "retrievals.npz": archive(
             index=index.astype(np.int32), similarity=similarity.astype(np.float32)
         ),
         "signals.csv": table_text("signals", signals).encode(),
@@ -277,6 +282,9 @@ def read_run(run: Path) -> Run:
         similarity=arrays["similarity"],
         config_toml=(run / "config.toml").read_text(encoding="utf-8"),
         manifest=manifest,
+        decisions=read_table(run / "decisions.csv", "decisions")
+        if "decisions.csv" in carried
+        else None,
         tracks=_read_tracks(run / "tracks.npz", manifest["tracks"])
         if "tracks.npz" in carried
         else None,

@@ -29,11 +29,12 @@ def plain(value: float) -> str:
 
 def _margin(p: float, threshold: float, terms: Mapping[str, float]) -> str:
     """Say how far a probability lies from the threshold, and what speaks most for off the map."""
-    name = max(terms, key=lambda name: terms[name])
-    loudest = f"most of it from {name}: {plain(terms[name])} log odds above in-map"
+    name, is_above = max(terms, key=lambda name: terms[name]), p > threshold
+    kind = "most of it from" if is_above else "its largest doubt is"
+    loudest = f"{kind} {name}: {plain(terms[name])} log odds above in-map"
     if terms[name] <= 0:
         loudest = "no signal lies above its in-map mean"
-    side = "exceeds" if p > threshold else "is within"
+    side = "exceeds" if is_above else "is within"
     return (
         f"probability {plain(p)} {side} threshold {plain(threshold)} by {plain(abs(p - threshold))}"
         f"; {loudest}"

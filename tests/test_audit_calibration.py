@@ -192,7 +192,7 @@ def test_terms_are_told_from_the_mean_in_map_frame(rng):
     np.testing.assert_allclose(log_odds_terms(model, own).mean(axis=0), 0.0, atol=1e-12)
 
 
-SEEN = MapFacts("ab12", 2.0, 0.9)
+SEEN = MapFacts("ab12", "ef56", 2.0, 0.9)
 
 
 @pytest.mark.parametrize(
@@ -200,8 +200,8 @@ SEEN = MapFacts("ab12", 2.0, 0.9)
     [
         (SEEN, None),
         (SEEN._replace(recall=0.895), None),
-        (SEEN._replace(recall=0.4), "other descriptors of this map"),
-        (MapFacts("cd34", 0.5, 0.4), "spacing 2 m and recall 0.90; here spacing 0.5 m and"),
+        (SEEN._replace(views_sha256="7890"), "other descriptors of this map"),
+        (MapFacts("cd34", "ef56", 0.5, 0.4), "spacing 2 m and recall 0.90; here spacing 0.5 m and"),
     ],
 )
 def test_a_calibration_knows_its_map(here, words, rng, tmp_path):

@@ -1,6 +1,7 @@
 """The command line: exit codes, one-line errors, and every file of the contract."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -118,10 +119,22 @@ def test_a_calibration_file_carries_the_verdicts_to_run_time(data_folder, tmp_pa
     decided = [row.split(",") for row in (scored / "decisions.csv").read_text().splitlines()[1:]]
     assert [row[1] for row in decided] == [row[1] for row in judged]
     assert [float(r[2]) for r in decided] == pytest.approx([float(r[2]) for r in judged], abs=1e-6)
+    assert "next:   taojax closures" in capfd.readouterr().err
+    truth = str(data_folder / "truth")
+    assert main(["evaluate", str(scored), "--truth", truth, "--r-in", "3", "--r-out", "6"]) == 0
+    said, n_accepted = capfd.readouterr().out, sum(row[1] == "accept" for row in decided)
+    first = re.match(
+        r"Decided at run time.* (\d+) were accepted at the right place and (\d+) at a wrong", said
+    )
+    assert first is not None
+    labels = [row.split(",")[1] for row in (scored / "labels.csv").read_text().splitlines()[1:]]
+    grey = sum(a[1] == "accept" and b == "grey" for a, b in zip(decided, labels, strict=True))
+    assert int(first[1]) + int(first[2]) + grey == n_accepted
+    assert main(["closures", str(scored)]) == 0
+    assert f"of the {n_accepted} accepted of all frames" in capfd.readouterr().out
     raw = bytearray((scored / "decisions.csv").read_bytes())
     raw[-3] ^= 1
     (scored / "decisions.csv").write_bytes(raw)
-    truth = str(data_folder / "truth")
     assert main(["evaluate", str(scored), "--truth", truth]) == 3
     assert "decisions.csv: seal broken" in capfd.readouterr().err
 

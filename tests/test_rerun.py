@@ -188,7 +188,10 @@ def add_lists(data):
 
 OTHER_DATA = {
     "an edited input": (change_odometry, "odometry.csv: sha256"),
-    "a missing input": (lambda d: (d / "map/descriptors.npy").unlink(), "map/descriptors.npy: can"),
+    "a missing input": (
+        lambda d: (d / "map/descriptors.npy").unlink(),
+        "map/descriptors.npy: no such file",
+    ),
     "an added list": (add_lists, "retrievals.npz: was not there when the run was sealed"),
     "an added note": (lambda d: (d / "about.toml").write_text("notes = []"), "about.toml: was not"),
     "no folder": (shutil.rmtree, "no such data folder"),

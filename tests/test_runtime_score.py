@@ -38,7 +38,7 @@ def test_a_calibration_of_another_map_is_noted_in_the_seal(rng, tmp_path):
     folder, one = write_folder(tmp_path / "data", rng), np.ones(1)
     seen = load_map(folder, SMALL.stream).facts
     notes = {}
-    for name, facts in (("same", seen), ("foreign", MapFacts("ab12", 2.0, 0.9)), ("old", None)):
+    for name, facts in (("same", seen), ("foreign", MapFacts("ab12", "", 2.0, 0.9)), ("old", None)):
         made_up = Detector(("tao",), one, one, one, 0.0, 0.5, "made up", facts)
         score(folder, tmp_path / name, SMALL, detector=made_up)
         notes[name] = records.read_manifest(tmp_path / name)["notes"]

@@ -11,7 +11,7 @@ from taojax.audit import calibration, labels, metrics, tables
 from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
 from taojax.config import Config
-from taojax.detector import Detector, MapFacts
+from taojax.detector import Detector, MapFacts, map_of
 from taojax.records import Run, signal_names
 from taojax.verdicts import decide
 
@@ -44,6 +44,10 @@ class Judgement(NamedTuple):
     recall_curves: dict[float, np.ndarray]
     """Radius [m] -> recall@1..K."""
 
+    decided: Shaped[np.ndarray, " t"] | None
+    """What led where at run time, with numbers frozen elsewhere, as `outcome`; None where nobody
+    decided."""
+
     verdicts: tables.Table
     metrics: tables.Table
     recall: tables.Table
@@ -74,10 +78,10 @@ def _outcomes(
 
 def _map_of(manifest: Mapping[str, Any]) -> MapFacts | None:
     """Return which map a run was scored on; None where an older manifest does not say."""
-    poses = manifest["sha256"].get("inputs/map/poses.csv")
-    if poses is None or "map_spacing_m" not in manifest:
+    hashes = manifest["sha256"]
+    if "inputs/map/poses.csv" not in hashes or "map_spacing_m" not in manifest:
         return None
-    return MapFacts(poses, float(manifest["map_spacing_m"]), float(manifest["map_recall"]))
+    return map_of(hashes, float(manifest["map_spacing_m"]), float(manifest["map_recall"]))
 
 
 def judge(run: Run, truth: Truth, config: Config) -> Judgement:
@@ -127,6 +131,9 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         label=label,
         splits=splits,
         outcome=_outcomes(verdicts["verdict"], label, error, 2 * audit.r_in_m),
+        decided=None
+        if run.decisions is None
+        else _outcomes(run.decisions["verdict"], label, error, 2 * audit.r_in_m),
         recall_curves=curves,
         verdicts=verdicts,
         metrics=tables.metrics_table(signals, label, splits, audit, config.seed),

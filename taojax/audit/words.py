@@ -24,9 +24,19 @@ MAIN = ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused")
 
 _MOST = 0.5  # beyond this share a rate is called "most"
 
+FALLBACK = "The probability is a fallback"
+"""So begins the note of a detector that had too few frames to be fitted."""
+
 TOO_SHORT = "The recording is too short to hold a test split: nothing is scored out of sample."
 BLIND = "The calibration split holds no in-map frame, so there is no threshold."
-NO_SHIELD = "Here taojax does not protect the map: it accepts most answers given off the map."
+NO_SHIELD = (
+    "Here taojax does not protect the map: do not let these closures into a graph. It accepts most "
+    "answers given off the map, or more wrong ones than right ones."
+)
+UNTESTED = (
+    "Not tested off the map: the test split holds no map-out frame, so there is no false "
+    "acceptance rate. Record a drive that leaves the map in both halves."
+)
 
 
 def metric_row(judgement: Judgement, signal: str) -> dict[str, Any]:
@@ -86,15 +96,13 @@ def _false_acceptance(judgement: Judgement) -> list[str]:
     far, left = rates[VERDICT_FAR], rates[LEFT_OUT]
     n, n_out, n_left = (int(x) for x in (far["n"], far["n_of"], left["n"]))
     if not n_out:
-        return ["The test split holds no map-out frame, so there is no false acceptance rate."]
-    said = [NO_SHIELD] if far["value"] > _MOST else []
+        return []
     prevalence = metric_row(judgement, "fused")["prevalence_test"]
-    said.append(
+    return [
         f"False acceptance rate {rate(far, 'value')}: of {n_out} map-out test frames (prevalence "
         f"{prevalence:.2f}) the verdicts accepted {n}, rejected {n_out - n - n_left} and "
         f"abstained on {n_left}."
-    )
-    return said
+    ]
 
 
 def _false_rejection(judgement: Judgement) -> list[str]:
@@ -217,17 +225,53 @@ def _clock(judgement: Judgement) -> list[str]:
     ]
 
 
-_LEAD = (_counts, _false_acceptance, _failures)
+def _is_mostly_wrong(outcome: np.ndarray) -> bool:
+    return int(np.sum(outcome == "accepted_wrong")) > int(np.sum(outcome == "accepted_in"))
+
+
+def _use(judgement: Judgement) -> list[str]:
+    """Say first what forbids to trust the rest."""
+    if np.isnan(judgement.detector.threshold) or not len(judgement.splits.test.frame):
+        return []
+    far, said = rates_of(judgement)[VERDICT_FAR], []
+    is_open = far["n_of"] > 0 and far["value"] > _MOST
+    if is_open or _is_mostly_wrong(judgement.outcome[judgement.splits.test.frame]):
+        said.append(NO_SHIELD)
+    if not far["n_of"]:
+        said.append(UNTESTED)
+    if judgement.detector.note.startswith(FALLBACK):
+        said.append(judgement.detector.note)
+    return said
+
+
+def _decided(judgement: Judgement) -> list[str]:
+    """Judge what was decided at run time: its numbers are frozen, so every frame is a test."""
+    decided = judgement.decided
+    if decided is None:
+        return []
+    many = lambda *kinds: int(np.isin(decided, kinds).sum())
+    is_out, is_in = judgement.label == "map_out", judgement.label == "in_map"
+    accepted = np.isin(decided, ("accepted_in", "accepted_wrong"))
+    rejected = np.isin(decided, ("rejected_in", "rejected_out"))
+    return [
+        f"Decided at run time, with numbers frozen elsewhere (decisions.csv): of all "
+        f"{len(decided) - many('grey')} labelled frames {many('accepted_in')} were accepted at "
+        f"the right place and {many('accepted_wrong')} at a wrong place; "
+        f"{int((accepted & is_out).sum())} of {int(is_out.sum())} map-out frames were accepted, "
+        f"{int((rejected & is_in).sum())} of {int(is_in.sum())} in-map frames rejected, "
+        f"{many('abstained')} left open. All that follows is judged anew, calibrated "
+        "on the first half of this run (verdicts.csv)."
+    ]
+
+
+_LEAD = (_decided, _use, _counts, _false_acceptance, _failures)
 
 
 def warnings(judgement: Judgement) -> tuple[str, ...]:
     """Return those of the sentences that should alarm the reader."""
-    found = {TOO_SHORT, BLIND, NO_SHIELD, *_clock(judgement)}
-    outcome = judgement.outcome[judgement.splits.test.frame]
-    if np.sum(outcome == "accepted_wrong") > np.sum(outcome == "accepted_in"):
+    found = {TOO_SHORT, BLIND, *_use(judgement), *_clock(judgement)}
+    if _is_mostly_wrong(judgement.outcome[judgement.splits.test.frame]):
         found.update(_counts(judgement))
-    if judgement.detector.note.startswith("The probability is a fallback"):
-        found.add(judgement.detector.note)
     return tuple(sentence for sentence in find_words(judgement) if sentence in found)
 
 
@@ -245,7 +289,8 @@ def find_words(judgement: Judgement) -> tuple[str, ...]:
     ]
     promised = f"Conformal threshold of tao: {judgement.promise.sentence}"
     lead = lead_words(judgement)
-    return (*lead, *said, judgement.detector.note, promised, *_clock(judgement))
+    note = [] if judgement.detector.note in lead else [judgement.detector.note]
+    return (*lead, *said, *note, promised, *_clock(judgement))
 
 
 def terminal_table(judgement: Judgement) -> str:

@@ -7,7 +7,6 @@ other bits.
 """
 
 import importlib.util
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from jax import export
 
 from taojax.config import Config, StreamConfig, to_toml
 from taojax.errors import MissingExtraError
-from taojax.records import SCHEMA, digest, publish, refuse_if_taken, seal_of
+from taojax.records import SCHEMA, archive, digest, publish, refuse_if_taken, seal_of
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import load_observations
@@ -100,12 +99,6 @@ def check_exportable(out: Path) -> None:
         )
 
 
-def _archive(arrays: Mapping[str, np.ndarray]) -> bytes:
-    held = io.BytesIO()
-    np.savez_compressed(held, allow_pickle=False, **arrays)
-    return held.getvalue()
-
-
 def _listed(arrays: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     return [
         {"name": name, "shape": list(array.shape), "dtype": array.dtype.name}
@@ -162,8 +155,8 @@ def export_step(
     files = {
         "config.toml": to_toml(config).encode(),
         "load_step.py": LOADER.read_bytes(),
-        "start.npz": _archive(start),
-        "example.npz": _archive(named(example)),
+        "start.npz": archive(**start),
+        "example.npz": archive(**named(example)),
         **{f"step.{p}.jaxexport": artefact(inputs, p) for p in dict.fromkeys(platforms)},
     }
     sealed = {

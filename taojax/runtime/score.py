@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, replace, to_toml
-from taojax.detector import Detector, MapFacts, foreign_map
+from taojax.detector import Detector, foreign_map, map_of
 from taojax.detector import to_toml as detector_toml
 from taojax.errors import InputError
 from taojax.records import code_digest, refuse_if_taken, write_run
@@ -177,9 +177,7 @@ def score(
     command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records)
     notes = list(observations.notes)
-    here = MapFacts(
-        observations.sha256["inputs/map/poses.csv"], float(tables.spacing_m), float(tables.recall)
-    )
+    here = map_of(observations.sha256, float(tables.spacing_m), float(tables.recall))
     if detector is not None and (said := foreign_map(detector, here)):
         notes.append(said)
     return write_run(

@@ -96,8 +96,13 @@ def load_map(folder: Path, config: StreamConfig) -> LoadedMap:
             "must describe the same frames"
         )
     tables = map_tables(poses, config, descriptors)
-    digest = digest_file(inner / "poses.csv")
-    return LoadedMap(tables, scale, MapFacts(digest, float(tables.spacing_m), float(tables.recall)))
+    facts = MapFacts(
+        poses_sha256=digest_file(inner / "poses.csv"),
+        views_sha256="" if descriptors is None else digest_file(path),
+        spacing_m=float(tables.spacing_m),
+        recall=float(tables.recall),
+    )
+    return LoadedMap(tables, scale, facts)
 
 
 def _not_json(text: str) -> float:

@@ -2,12 +2,15 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from taojax.errors import InputError
 from taojax.verbs.common import flag, say
+
+if TYPE_CHECKING:
+    from taojax.closures import Verdicts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,22 +59,26 @@ def run(args: Closures) -> None:
     print(f"left out        {n['abstain']} on which nothing was decided, "
           f"{n_frames - n_posed} without a pose")  # fmt: skip
     print(f"trajectory.tum  {trajectory.count(chr(10))} accepted poses")
-    if told := _of_the_audit(args.run):
+    if told := _of_the_audit(args.run, verdicts):
         print(told)
+    for note in sealed.manifest["notes"]:
+        say(f"note: {note}")
     say(f"written to {folder}")
 
 
-def _of_the_audit(run: Path) -> str | None:
+def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
     """Say how far accepted frames could be believed where the run was judged."""
     from taojax.tables import read_table
 
-    if not all((run / name).is_file() for name in ("labels.csv", "verdicts.csv")):
+    if not (run / "labels.csv").is_file():
         return None
     labels = read_table(run / "labels.csv", "labels")
-    accepted = read_table(run / "verdicts.csv", "verdicts")["verdict"] == "accept"
-    is_test = accepted & (labels["split"] == "test")
-    n, n_off = int(is_test.sum()), int((is_test & (labels["label"] == "map_out")).sum())
+    accepted, where = verdicts.verdict == "accept", "all frames"
+    if verdicts.source == "verdicts.csv":
+        # Its numbers were fitted on the other half of the same run.
+        accepted, where = accepted & (labels["split"] == "test"), "the test half"
+    n, n_off = int(accepted.sum()), int((accepted & (labels["label"] == "map_out")).sum())
     return (
-        f"audit           {n_off} of the {n} accepted frames of the test half lie off the map; give"
-        " closures a robust kernel"
+        f"audit           {n_off} of the {n} accepted of {where} lie off the map"
+        f"{'; do not use these closures' if 2 * n_off > n else ''}; give closures a robust kernel"
     )

@@ -154,7 +154,8 @@ def odometry(
     """Describe the robot's motion and hold it against the truth, else against the map.
 
     Returns:
-        How far it strays from the truth over a window [m], where that is known.
+        How far it strays from the truth over a window [m], where that is known; infinite where it
+        cannot be motion at all.
     """
     if found.odometry is None:
         return None
@@ -177,7 +178,8 @@ def odometry(
         page.say("drift", f"{drift:.2g} m from the truth over {WINDOW} frames (median)")
     page.warn(
         scale is not None and not 1 / 3 <= scale <= 3,
-        f"odometry is {scale or 0:.3g} times {what}: are its rows metres from frame to frame?",
+        f"odometry is {scale or 0:.3g} times {what}: are its rows metres from frame to frame, or"
+        " poses (`taojax convert files --odometry-kind poses`)?",
     )
     times = moved.largest_m / moved.median_m if moved.median_m > 0 else 0.0
     page.warn(times > 20, f"odometry jumps: {largest} is {times:.0f} times the median step")
@@ -189,7 +191,8 @@ def odometry(
         moved.largest_yaw_rad > 1.01 * np.pi,
         f"a frame turns by {moved.largest_yaw_rad:.0f} rad: is dtheta_rad in degrees?",
     )
-    return drift
+    is_motion = truth is None or scale is None or 1 / 3 <= scale <= 3
+    return drift if is_motion else np.inf
 
 
 def radii(page: Page, proposed: Radii, nearest_m: "np.ndarray | None") -> str:
@@ -213,4 +216,11 @@ def radii(page: Page, proposed: Radii, nearest_m: "np.ndarray | None") -> str:
         f", {len(nearest_m) - n_in - n_out:,} between" if proposed.r_out_m > proposed.r_in_m else ""
     )
     page.say("with these", f"{n_in:,} frames are in-map, {n_out:,} map-out{grey}")
+    calibration, test = np.array_split(nearest_m > proposed.r_out_m, 2)
+    for half, is_out in (("first half, which calibrates", calibration), ("second half", test)):
+        page.warn(
+            n_out > 0 and not is_out.any(),
+            f"the {half}, holds no frame off the map: an audit cannot measure what is accepted"
+            " there; record a drive that leaves the map in both halves",
+        )
     return flags

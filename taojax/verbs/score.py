@@ -2,8 +2,9 @@
 
 import dataclasses
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -57,3 +58,21 @@ def run(args: Score) -> None:
     for note in manifest["notes"]:
         say(f"note: {note}")
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
+    say(_next(out, manifest))
+
+
+def _next(out: Path, manifest: Mapping[str, Any]) -> str:
+    """Say what was decided and what can be done with it."""
+    if "decisions.csv" not in manifest["sha256"]:
+        return (
+            "next:   no verdicts yet; add --calibration FILE of an audited run, or judge with"
+            f" taojax evaluate {out} --truth DIR"
+        )
+    from taojax.tables import read_table
+
+    verdict = read_table(out / "decisions.csv", "decisions")["verdict"]
+    n = {name: int((verdict == name).sum()) for name in ("accept", "reject", "abstain")}
+    return (
+        f"decided {n['accept']} accepted, {n['reject']} rejected, {n['abstain']} left open"
+        f" (decisions.csv)\nnext:   taojax closures {out}"
+    )
