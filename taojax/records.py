@@ -215,7 +215,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     if decisions is not None:
         files["decisions.csv"] = table_text("decisions", decisions).encode()
     if tracks is not None:
-        files["tracks.npz"] = _archive(
+        files["tracks.npz"] = archive(
             signal=np.stack([t.signal for t in tracks.values()]).astype(np.float32),
             pose=np.stack([t.pose for t in tracks.values()]).astype(np.float32),
             has_pose=np.stack([t.has_pose for t in tracks.values()]).astype(np.uint8),
