@@ -64,11 +64,11 @@ class Run:
     manifest: dict[str, Any]
     """What was run, on what, with which code."""
 
-    decisions: dict[str, np.ndarray] | None = None
-    """Run-time verdicts, as in data_specs/decisions.toml; None where nobody decided."""
-
     tracks: dict[str, SealedTrack] | None = None
     """Rivals by name; None where they were not asked for."""
+
+    decisions: dict[str, np.ndarray] | None = None
+    """Run-time verdicts, as in data_specs/decisions.toml; None where nobody decided."""
 
 
 def signal_names() -> tuple[str, ...]:
