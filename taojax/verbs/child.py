@@ -43,7 +43,12 @@ def run(words: Sequence[str]) -> int:
                 child.wait(HEARD_S)
             if child.poll() is None:
                 child.send_signal(signal.SIGINT)
-                child.wait()
+            # An interrupt may be lost inside an import; a closed pipe is not.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(HEARD_S)
+            if child.stdin is not None:
+                child.stdin.close()
+            child.wait()
             raise
 
 

@@ -120,6 +120,7 @@ def score_apart(
         path.write_text(to_toml(config), encoding="utf-8")
         flag = "--progress" if progress else "--no-progress"
         words = ["score", str(dataset), "--out", str(out), "--config", str(path), flag, *flags]
+        words.append("--no-advice")
         code = child.run(words)
     if code:
         raise SystemExit(code)

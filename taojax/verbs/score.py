@@ -32,6 +32,9 @@ class Score(Common):
     rival_logs: Annotated[int | None, flag("N", "all")] = None
     """Of a folder of trials, run the rivals on the first so many alone."""
 
+    advice: bool = True
+    """Say what can be done with the run."""
+
 
 def run(args: Score) -> None:
     """Score a data folder and seal the result."""
@@ -58,7 +61,8 @@ def run(args: Score) -> None:
     for note in manifest["notes"]:
         say(f"note: {note}")
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
-    say(_next(out, manifest))
+    if args.advice:
+        say(_next(out, manifest))
 
 
 def _next(out: Path, manifest: Mapping[str, Any]) -> str:
