@@ -1,10 +1,17 @@
-"""What a data folder says of itself: about.toml."""
+"""Data folders: names of their descriptors, and what one says of itself (about.toml)."""
 
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
 from taojax.specs import fail, read_text
+
+DESCRIPTORS = (
+    ("map/descriptors.npy", "query/descriptors.npy"),
+    # As VPR-methods-evaluation writes them.
+    ("database_descriptors.npy", "queries_descriptors.npy"),
+)
+"""The names that map and query descriptors may have in a data folder; one pair is there."""
 
 
 class About(NamedTuple):

@@ -22,9 +22,6 @@ LIST_RECALL = 0.75
 """Recall of retrieval lists without map descriptors, and of a run that does not say: neither blind
 nor sure."""
 
-MAP_VIEWS = ("map/descriptors.npy", "database_descriptors.npy")
-"""Names that the map's descriptors may have in a data folder."""
-
 
 class MapFacts(NamedTuple):
     """Which map a detector was fitted on, told by what both sides can measure."""
@@ -67,19 +64,6 @@ class Detector(NamedTuple):
     """None where the run did not say."""
 
 
-def map_of(hashes: Mapping[str, str], spacing_m: float, recall: float) -> MapFacts:
-    """Return which map some sealed inputs speak of.
-
-    Args:
-        hashes: `inputs/` and file below the data folder -> SHA-256.
-        spacing_m: of the map.
-        recall: of the map.
-    """
-    hashes = {name.removeprefix("inputs/"): value for name, value in hashes.items()}
-    seen = next((hashes[name] for name in MAP_VIEWS if name in hashes), "")
-    return MapFacts(hashes["map/poses.csv"], seen, spacing_m, recall)
-
-
 def log_odds_terms(
     detector: Detector, signals: Mapping[str, np.ndarray]
 ) -> Float[np.ndarray, "t f"]:
@@ -100,20 +84,18 @@ def probability(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[
     return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
 
 
-def foreign_map(detector: Detector, here: MapFacts) -> str | None:
+def foreign_map(detector: Detector, here: MapFacts | None) -> str | None:
     """Say so where a detector was fitted on another map than the one at hand.
 
     Args:
         detector: frozen numbers.
-        here: the map that it is about to judge.
+        here: the map that it is about to judge; None = unknown.
 
     Returns:
         One sentence; None where the map is the same, or nobody knows.
     """
     then = detector.fitted_on
-    if then is None:
-        return None
-    if then[:2] == here[:2]:
+    if then is None or here is None or then[:2] == here[:2]:
         return None
     is_same = then.poses_sha256 == here.poses_sha256
     what = "other descriptors of this map" if is_same else "another map"

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from taojax.about import DESCRIPTORS
+from taojax.detector import MapFacts
 from taojax.errors import InputError
 from taojax.parts import locked_part
 from taojax.specs import fail, load_spec, open_file, read_bytes, read_npz, write_atomically
@@ -20,9 +22,9 @@ SCHEMA = 1
 
 INPUTS = "inputs/"
 """Before the names of sensor files in a manifest."""
+
 SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
 """Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
-
 
 CARRIED = ("odometry.csv", "decisions.csv", "detector.toml", "tracks.npz")
 """Sealed like the others where they are there: odometry since runs can be explained, the rest where
@@ -96,6 +98,16 @@ def input_hashes(manifest: Mapping[str, Any]) -> dict[str, str]:
     """Return file below the data folder -> SHA-256 of everything that a run was made from."""
     hashes = manifest["sha256"].items()
     return {n.removeprefix(INPUTS): h for n, h in hashes if n.startswith(INPUTS)}
+
+
+def map_of(manifest: Mapping[str, Any]) -> MapFacts | None:
+    """Return which map a run was scored on; None where an older manifest does not say."""
+    hashes = input_hashes(manifest)
+    if "map/poses.csv" not in hashes or "map_spacing_m" not in manifest:
+        return None
+    seen = next((hashes[name] for name, _ in DESCRIPTORS if name in hashes), "")
+    spacing_m, recall = float(manifest["map_spacing_m"]), float(manifest["map_recall"])
+    return MapFacts(hashes["map/poses.csv"], seen, spacing_m, recall)
 
 
 def code_digest() -> str:

@@ -67,7 +67,7 @@ def test_strict_labels_with_one_class_draw_nothing(tmp_path):
 
 
 def test_the_trace_figure_holds_every_frame_of_every_scenario(judgement, tmp_path):
-    done = Evaluation(tmp_path, judgement, (), "", "taojax audit")
+    done = Evaluation(tmp_path, judgement, (), "taojax audit")
     picture = scenario_figures.traces({"default": done, "h3": done})
     table = csv(picture)
     assert len(table) == 2 * len(judgement.label)
@@ -77,7 +77,7 @@ def test_the_trace_figure_holds_every_frame_of_every_scenario(judgement, tmp_pat
 
 
 def test_the_maps_figure_holds_true_and_answered_positions(judgement, tmp_path):
-    done = Evaluation(tmp_path, judgement, (), "", "taojax audit")
+    done = Evaluation(tmp_path, judgement, (), "taojax audit")
     table = csv(summary.maps({"default": done}))
     test = judgement.splits.test.frame
     np.testing.assert_array_equal(table["frame"], test)
@@ -88,7 +88,7 @@ def test_the_maps_figure_holds_true_and_answered_positions(judgement, tmp_path):
 
 def test_the_trace_figure_draws_a_run_without_thresholds(judgement, tmp_path):
     metrics = judgement.metrics | {"threshold": np.full(len(judgement.metrics["signal"]), np.nan)}
-    blind = Evaluation(tmp_path, judgement._replace(metrics=metrics), (), "", "taojax audit")
+    blind = Evaluation(tmp_path, judgement._replace(metrics=metrics), (), "taojax audit")
     assert scenario_figures.traces({"default": blind}).png
 
 

@@ -10,7 +10,7 @@ from taojax.audit import figures, report, tables
 from taojax.audit.judgement import Evaluation, Judgement, judge
 from taojax.audit.paste import paste_files
 from taojax.audit.truth import Truth, read_truth
-from taojax.audit.words import find_words, terminal_table
+from taojax.audit.words import find_words
 from taojax.config import Config
 from taojax.detector import to_toml
 from taojax.records import read_run
@@ -88,7 +88,6 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
         run=run,
         judgement=judgement,
         sentences=find_words(judgement),
-        table=terminal_table(judgement),
         command=_command(run, truth, config),
     )
     files |= paste_files(judgement, done.command)

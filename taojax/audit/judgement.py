@@ -1,6 +1,5 @@
 """Judge a run in memory: from sealed signals and truth to labels, verdicts and tables."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,8 +10,8 @@ from taojax.audit import calibration, labels, metrics, tables
 from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
 from taojax.config import Config
-from taojax.detector import Detector, MapFacts, map_of
-from taojax.records import Run, signal_names
+from taojax.detector import Detector
+from taojax.records import Run, map_of, signal_names
 from taojax.verdicts import decide
 
 
@@ -76,14 +75,6 @@ def _outcomes(
     return np.where(label == "grey", "grey", outcome)
 
 
-def _map_of(manifest: Mapping[str, Any]) -> MapFacts | None:
-    """Return which map a run was scored on; None where an older manifest does not say."""
-    hashes = manifest["sha256"]
-    if "inputs/map/poses.csv" not in hashes or "map_spacing_m" not in manifest:
-        return None
-    return map_of(hashes, float(manifest["map_spacing_m"]), float(manifest["map_recall"]))
-
-
 def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     """Judge a sealed run.
 
@@ -104,7 +95,7 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     share, gap = audit.calibration_share, config.stream.window
     first = labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
     recall = float(run.manifest.get("map_recall", calibration.LIST_RECALL))
-    model = calibration.fit(first.calibration, recall, _map_of(run.manifest))
+    model = calibration.fit(first.calibration, recall, map_of(run.manifest))
     verdicts = decide(model, run.signals)
     # Cut again with the probability beside the signals: only the splitter makes the two tables.
     with_fused = signals | {tables.FUSED: verdicts["probability_map_out"]}
@@ -154,9 +145,6 @@ class Evaluation(NamedTuple):
     judgement: Judgement
     sentences: tuple[str, ...]
     """What was found, most important first."""
-
-    table: str
-    """The main signals as aligned text."""
 
     command: str
     """How to repeat the judging."""

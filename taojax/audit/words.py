@@ -291,14 +291,3 @@ def find_words(judgement: Judgement) -> tuple[str, ...]:
     lead = lead_words(judgement)
     note = [] if judgement.detector.note in lead else [judgement.detector.note]
     return (*lead, *said, *note, promised, *_clock(judgement))
-
-
-def terminal_table(judgement: Judgement) -> str:
-    """Return the main signals as aligned text of at most 80 characters."""
-    columns = ("auroc", "far_at_95", "auroc_test", "threshold", "far", "frr", "delay_frames")
-    lines = [f"{'signal':<10}" + "".join(f"{name:>13}" for name in columns[:-1]) + f"{'delay':>8}"]
-    for signal in MAIN:
-        row = metric_row(judgement, signal)
-        cells = ["-" if np.isnan(row[name]) else f"{row[name]:.3f}" for name in columns]
-        lines.append(f"{signal:<10}" + "".join(f"{c:>13}" for c in cells[:-1]) + f"{cells[-1]:>8}")
-    return "\n".join(lines)

@@ -21,8 +21,7 @@ from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.inside import Inside, joint_inside, rank_inside
 from taojax.runtime.joint import DISTINCT_DELTAS, GAMMA
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.score import COMPILING
-from taojax.runtime.stream import StreamState, cost_params, init, step
+from taojax.runtime.stream import COMPILING, StreamState, cost_params, init, step
 from taojax.tables import MOTION, POSE, read_table, stacked
 
 TOLERANCE = 1e-4

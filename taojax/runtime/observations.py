@@ -7,18 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from taojax.about import read_about
+from taojax.about import DESCRIPTORS, read_about
 from taojax.errors import InputError
-from taojax.records import digest_file
+from taojax.records import INPUTS, digest_file
 from taojax.specs import read_npy, read_npz
 from taojax.tables import MOTION, POSE, read_table, stacked
-
-DESCRIPTORS = (
-    ("map/descriptors.npy", "query/descriptors.npy"),
-    # As VPR-methods-evaluation writes them.
-    ("database_descriptors.npy", "queries_descriptors.npy"),
-)
-"""The names that map and query descriptors may have in a data folder; one pair is there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +195,6 @@ def load_observations(folder: Path) -> Observations:
         descriptors=descriptors,
         retrievals=retrievals,
         notes=notes,
-        sha256={f"inputs/{name}": digest_file(folder / name) for name in files},
+        sha256={INPUTS + name: digest_file(folder / name) for name in files},
         trial_frames=trial_frames,
     )

@@ -12,26 +12,22 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, replace, to_toml
-from taojax.detector import Detector, foreign_map, map_of
+from taojax.detector import Detector, foreign_map
 from taojax.detector import to_toml as detector_toml
 from taojax.errors import InputError
-from taojax.records import code_digest, refuse_if_taken, write_run
+from taojax.records import code_digest, map_of, refuse_if_taken, write_run
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
-from taojax.runtime.stream import init, replay
+from taojax.runtime.stream import COMPILING, init, replay
 from taojax.runtime.trials import in_trials, replay_trials
 from taojax.specs import read_bytes
 from taojax.verdicts import decide
 
 CHUNK_FRAMES = 256
 """Frames per scan; one compilation, and a progress bar that moves."""
-
-
-COMPILING = "compiling once"
-"""On a bar until the first frames are done, some 5 to 20 s: one that stands still alarms."""
 
 
 def candidates(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
@@ -177,8 +173,8 @@ def score(
     command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records)
     notes = list(observations.notes)
-    here = map_of(observations.sha256, float(tables.spacing_m), float(tables.recall))
-    if detector is not None and (said := foreign_map(detector, here)):
+    known_map = {**map_facts(tables), "sha256": observations.sha256}
+    if detector is not None and (said := foreign_map(detector, map_of(known_map))):
         notes.append(said)
     return write_run(
         out,
@@ -194,8 +190,7 @@ def score(
         manifest={
             **facts_of(command, dataset, config.seed),
             "notes": notes,
-            **map_facts(tables),
+            **known_map,
             "trial_frames": n,
-            "sha256": observations.sha256,
         },
     )

@@ -36,6 +36,9 @@ from taojax.runtime.scale import rescale
 WARM_FRAMES = 3
 """Frames seen before anything is said of a place."""
 
+COMPILING = "compiling once"
+"""On a bar until the first frames are done, some 5 to 20 s: one that stands still alarms."""
+
 
 class Memory(eqx.Module):
     """What only joint association remembers."""

@@ -18,13 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from taojax.about import DESCRIPTORS
 from taojax.config import StreamConfig
 from taojax.detector import Detector, MapFacts
 from taojax.errors import InputError
 from taojax.records import digest_file
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.observations import DESCRIPTORS, descriptor_names
+from taojax.runtime.observations import descriptor_names
 from taojax.runtime.retrieval import N_KEPT
 from taojax.runtime.stream import init, step
 from taojax.specs import read_npy

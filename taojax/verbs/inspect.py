@@ -50,7 +50,7 @@ def run(args: Inspect) -> None:
     drift_m = tell.odometry(page, found, truth, shape)
     lengths(page, found)
     command = f"taojax score {quote(str(args.dataset))}"
-    if shape is not None and drift_m != float("inf"):
+    if shape is not None and drift_m != tell.NO_MOTION:
         radii = suggest_radii(shape, drift_m)
         nearest_m = likeness(page, found, truth, shape, radii)
         if truth is not None:
@@ -60,7 +60,7 @@ def run(args: Inspect) -> None:
     refusal = _refusal(args.dataset, found, None if args.anyway else matched)
     if refusal:
         page.end(f"refused: {refusal}")
-    elif drift_m == float("inf"):
+    elif drift_m == tell.NO_MOTION:
         page.end("not ready: mend the odometry and inspect again")
     else:
         page.end("ready; next", command)

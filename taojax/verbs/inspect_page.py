@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 WINDOW = 20
 """Frames over which the drift of odometry is told: the default window."""
 
+NO_MOTION = float("inf")
+"""The drift of odometry that cannot be motion from frame to frame."""
+
 UNITS = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
@@ -154,8 +157,8 @@ def odometry(
     """Describe the robot's motion and hold it against the truth, else against the map.
 
     Returns:
-        How far it strays from the truth over a window [m], where that is known; infinite where it
-        cannot be motion at all.
+        How far it strays from the truth over a window [m], where that is known; `NO_MOTION` where
+        it cannot be motion at all.
     """
     if found.odometry is None:
         return None
@@ -192,7 +195,7 @@ def odometry(
         f"a frame turns by {moved.largest_yaw_rad:.0f} rad: is dtheta_rad in degrees?",
     )
     is_motion = truth is None or scale is None or 1 / 3 <= scale <= 3
-    return drift if is_motion else np.inf
+    return drift if is_motion else NO_MOTION
 
 
 def radii(page: Page, proposed: Radii, nearest_m: "np.ndarray | None") -> str:
