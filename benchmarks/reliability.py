@@ -95,7 +95,7 @@ def _faults(quick: bool) -> Iterator[Row]:
 def _stream(quick: bool) -> Iterator[Row]:
     from benchmarks import reliability_stream as stream
 
-    for association, n in (("rank", 1_000_000), ("joint", 100_000)):
+    for association, n in (("rank", 1_000_000), ("joint", 1_000_000)):
         gone = stream.drive(association, 10_000 if quick else n)
         far = max(gap for name, gap in gone.differs.items() if name not in stream.REMEMBERS)
         memory = max(gone.differs[name] for name in stream.REMEMBERS)

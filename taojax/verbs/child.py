@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Sequence
 
-HEARD_S = 2.0
+HEARD_S = 5.0
 """So long a child may take to end after an interrupt, before it is told again."""
 
 
@@ -28,19 +28,24 @@ def start(words: Sequence[str], *, has_own_group: bool = False) -> subprocess.Po
     return subprocess.Popen(command, stdin=subprocess.PIPE, process_group=group)
 
 
-def run(words: Sequence[str]) -> int:
+def run(words: Sequence[str], *, has_own_group: bool = False) -> int:
     """Run a verb in a fresh interpreter to its end and return the exit code.
+
+    Args:
+        words: verb and flags.
+        has_own_group: a terminal's Ctrl-C reaches the child through this process alone.
 
     Raises:
         KeyboardInterrupt: after the child has ended too.
     """
-    with start(words) as child:
+    with start(words, has_own_group=has_own_group) as child:
         try:
             return child.wait()
         except KeyboardInterrupt:
             # A terminal tells both; somebody who tells this process alone means both.
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(HEARD_S)
+            if not has_own_group:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.wait(HEARD_S)
             if child.poll() is None:
                 child.send_signal(signal.SIGINT)
             # An interrupt may be lost inside an import; a closed pipe is not.

@@ -3,7 +3,6 @@
 from pathlib import Path
 from shlex import quote
 
-from taojax.about import DESCRIPTORS
 from taojax.errors import InputError
 
 __all__ = ["advice", "check_folder", "check_layout", "missing"]
@@ -50,6 +49,8 @@ def check_folder(folder: Path) -> None:
 
 def missing(folder: Path) -> list[str]:
     """Return what a data folder lacks to be scored."""
+    from taojax.about import DESCRIPTORS
+
     lacks = [name for name in ("map/poses.csv", "query/odometry.csv")
              if not (folder / name).exists()]  # fmt: skip
     there = [[(folder / name).exists() for name in pair] for pair in DESCRIPTORS]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-import signal
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from taojax.errors import InputError
-from taojax.verbs.child import start
+from taojax.verbs import child
 from taojax.verbs.common import Common, config_of, flag, out_of, say
 
 if TYPE_CHECKING:
@@ -111,12 +110,10 @@ def _compute_apart(
         words = ["sweep", str(dataset), "--out", str(out), "--config", str(settings)]
         words += ["--grid", str(values), "--no-judge"]
         words += ["--progress" if progress else "--no-progress"]
-        # In a group of its own the child hears of an interrupt once, from here.
-        with start(words, has_own_group=True) as child:
-            try:
-                code = child.wait()
-            except KeyboardInterrupt:
-                child.send_signal(signal.SIGINT)
-                code = child.wait()
+        try:
+            # In a group of its own the child hears of an interrupt once, and says how to go on.
+            code = child.run(words, has_own_group=True)
+        except KeyboardInterrupt:
+            code = 130
     if code:
         raise SystemExit(code)
