@@ -71,7 +71,7 @@ def _faults(quick: bool) -> Iterator[Row]:
     spent, n = time.monotonic() - begun, found.pop("sealing: kills")
     yield Row("kill -9 while sealing", n, _words(found), spent, "sealing: half sealed" not in found)
     begun = time.monotonic()
-    found = faults.kills(2 if quick else 200)
+    found = faults.kills(2 if quick else 200, say=print)
     bad = [name for name in found if not name.endswith((*faults.FINISHED, faults.TOO_LATE))]
     late = sum(n for name, n in found.items() if name.endswith(faults.TOO_LATE))
     spent = time.monotonic() - begun

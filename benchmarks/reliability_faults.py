@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -109,7 +109,12 @@ def _again(job: Job, data: Path, out: Path) -> Killed:
     return Killed("a part left" if left else "finished again", time.monotonic() - begun)
 
 
-def kills(n: int, jobs: Sequence[Job] = JOBS[1:], seed: int = 0) -> Counter[str]:
+def kills(
+    n: int,
+    jobs: Sequence[Job] = JOBS[1:],
+    seed: int = 0,
+    say: Callable[[str], None] = lambda line: None,
+) -> Counter[str]:
     """Kill jobs n times in all at random moments, two at a time; return how many came to what.
 
     Blows that fell after the end are told too, and do not count among the n.
@@ -118,6 +123,7 @@ def kills(n: int, jobs: Sequence[Job] = JOBS[1:], seed: int = 0) -> Counter[str]
         n: in all.
         jobs: in turn; `score` is left out because `audit` starts one.
         seed: of the moments.
+        say: is told of every blow.
 
     Raises:
         AssertionError: a job fails undisturbed.
@@ -141,7 +147,9 @@ def kills(n: int, jobs: Sequence[Job] = JOBS[1:], seed: int = 0) -> Counter[str]
                 # A machine with other work is not equally fast all the time.
                 whole_s[job] = killed.whole_s or whole_s[job]
                 outcomes.append(killed.outcome)
-            return [f"{job.name}: {outcome}" for outcome in outcomes]
+            found = [f"{job.name}: {outcome}" for outcome in outcomes]
+            say(f"blow {at + 1} of {n}: {', '.join(found)}")
+            return found
 
         # Compiling is not what is tried here; the first runs fill the cache, undisturbed.
         cache = {

@@ -1,16 +1,27 @@
 """Strict JAX settings for every test, and small data folders to run on."""
 
+import atexit
 import os
+import shutil
+import tempfile
 import zlib
 from pathlib import Path
 
 # Subprocesses and tests share nothing but the CPU: no accelerator, no preallocation.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Commands are tried in fresh interpreters, which would compile the same programs over and over.
+# One folder per worker: JAX writes entries in place, and another could read half of one.
+os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="taojax-tests-")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 
 import jax
 import numpy as np
 import pytest
 
+ALONE = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+"""For processes that compile side by side, or whose own compiling is what is tried."""
+
+atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import on_devices
 import pytest
+from conftest import ALONE
 
 from taojax.runtime import parallel
 
@@ -22,7 +23,7 @@ def run(folder, n_devices, *clusters):
     children = [
         subprocess.Popen(
             [sys.executable, "-W", "error", on_devices.__file__, folder, *line],
-            env=os.environ | {"JAX_PLATFORMS": "cpu"} | flags,
+            env=os.environ | ALONE | flags,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import write_folder
+from conftest import ALONE, write_folder
 
 from taojax import records
 from taojax.cli import main
@@ -72,7 +72,7 @@ def elsewhere(home, tmp_path_factory):
         words = [str(home / "data"), str(folder / name), str(folder / "config.toml")]
         children[name] = subprocess.Popen(
             [sys.executable, "-W", "error", "-c", SCORE, *words],
-            env=os.environ | {"JAX_PLATFORMS": "cpu"} | env,
+            env=os.environ | ALONE | env,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
