@@ -10,6 +10,7 @@ import pytest
 from conftest import write_folder
 
 from taojax.verbs import child
+from taojax.verbs.common import run_apart
 
 STARTS = """
 import sys
@@ -24,7 +25,7 @@ import sys
 from taojax.verbs import child
 print("ready", flush=True)
 child.HEARD_S = 0.1
-child.run(sys.argv[1:])
+child.run([sys.argv[1:]])
 """
 
 
@@ -87,5 +88,29 @@ def test_an_interrupt_of_the_parent_alone_ends_the_child_too(long_job, tmp_path)
 
 
 def test_an_exit_code_comes_back(capfd):
-    assert child.run(["nonsense"]) == 2
+    assert child.run([["nonsense"]]) == 2
     assert "nonsense" in capfd.readouterr().err
+
+
+def test_after_a_failure_no_other_is_begun_and_the_others_end(long_job, tmp_path, capfd):
+    asked = []
+
+    def commands():
+        for words in (long_job, ["nonsense"], ["score", "never"]):
+            asked.append(words[0])
+            yield words
+
+    assert child.run(commands(), most=2) == 2
+    assert asked == ["score", "nonsense"]
+    assert not (tmp_path / "run").exists()
+    said = capfd.readouterr().err
+    assert "nonsense" in said
+    assert "interrupted" not in said
+
+
+def test_a_child_that_was_killed_is_told_with_its_signal(monkeypatch, capsys):
+    monkeypatch.setattr(child, "run", lambda commands, most: -signal.SIGKILL)
+    with pytest.raises(SystemExit) as left:
+        run_apart([["score"]])
+    assert left.value.code == 137
+    assert "SIGKILL" in capsys.readouterr().err

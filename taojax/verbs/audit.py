@@ -13,6 +13,7 @@ from taojax.verbs.common import (
     SCENARIOS,
     Common,
     Scenario,
+    Scoring,
     config_of,
     flag,
     out_of,
@@ -79,7 +80,7 @@ def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool)
     # The report is written last: a sealed run without one was stopped while it was judged.
     if (out / "report.html").exists() or not is_sealed(out, dataset, config):
         refuse_if_taken(out)
-    score_apart(dataset, out, config, progress=progress)
+    score_apart([Scoring(dataset, out)], config, progress=progress)
     _judge(dataset, out, config)
 
 
@@ -96,7 +97,7 @@ def _audit_converted(
     if not is_sealed(out, data, config):
         if not is_sealed(scored, data, config):
             shutil.rmtree(scored, ignore_errors=True)
-        score_apart(data, scored, config, progress=progress)
+        score_apart([Scoring(data, scored)], config, progress=progress)
         # A run is published into an empty folder alone, and this one holds its data already.
         for path in sorted(scored.iterdir(), key=lambda path: path.name == "manifest.json"):
             path.rename(out / path.name)
@@ -130,7 +131,7 @@ def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress
         shutil.rmtree(folder, ignore_errors=True)
         write_world(scenario(world, name), folder)
         say(f"scoring scenario {name} (simulated)")
-        score_apart(folder, out / name, config, progress=progress)
+        score_apart([Scoring(folder, out / name)], config, progress=progress)
     from taojax.audit.evaluate import evaluate
     from taojax.audit.report import write_summary
 

@@ -2,12 +2,13 @@
 
 import dataclasses
 import hashlib
+import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 
@@ -103,24 +104,55 @@ def out_of(args: Common, verb: str, config: "Config") -> Path:
     )
 
 
+class Scoring(NamedTuple):
+    """A run that is wanted."""
+
+    dataset: Path
+    out: Path
+    flags: Sequence[str] = ()
+
+
+def run_apart(commands: Iterable[Sequence[str]], most: int = 1) -> None:
+    """Run verbs in fresh interpreters, so many side by side.
+
+    Raises:
+        SystemExit: one failed and has said why.
+    """
+    code = child.run(commands, most)
+    if code < 0:
+        say(
+            f"taojax: a process of this command was ended by {signal.Signals(-code).name}, perhaps"
+            " for want of memory; what is sealed is kept"
+        )
+    if code:
+        raise SystemExit(code if code > 0 else 128 - code)
+
+
 def score_apart(
-    dataset: Path, out: Path, config: "Config", *, progress: bool, flags: Sequence[str] = ()
+    jobs: Iterable[Scoring], config: "Config", *, progress: bool, most: int = 1
 ) -> None:
-    """Score in a fresh interpreter: one in which the judge has never been imported.
+    """Score in fresh interpreters: ones in which the judge has never been imported.
 
     A run that is sealed already, of the same data, settings and code, is kept as it is.
+
+    Args:
+        jobs: asked for when the turn of each has come.
+        config: settings of all.
+        progress: draw bars.
+        most: side by side.
     """
     from taojax.config import to_toml
 
-    if is_sealed(out, dataset, config):
-        say(f"{out} is sealed already; going on")
-        return
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "config.toml"
         path.write_text(to_toml(config), encoding="utf-8")
-        flag = "--progress" if progress else "--no-progress"
-        words = ["score", str(dataset), "--out", str(out), "--config", str(path), flag, *flags]
-        words.append("--no-advice")
-        code = child.run(words)
-    if code:
-        raise SystemExit(code)
+        shared = ["--config", str(path), "--progress" if progress else "--no-progress"]
+
+        def commands() -> Iterator[Sequence[str]]:
+            for dataset, out, flags in jobs:
+                if is_sealed(out, dataset, config):
+                    say(f"{out} is sealed already; going on")
+                    continue
+                yield ["score", str(dataset), "--out", str(out), *shared, *flags, "--no-advice"]
+
+        run_apart(commands(), most)

@@ -2,15 +2,23 @@
 
 import dataclasses
 import sys
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import tyro
 
 from taojax.errors import InputError, UsageError
-from taojax.verbs.common import Common, config_of, flag, out_of, say, score_apart, told
+from taojax.verbs.common import (
+    Common,
+    Scoring,
+    config_of,
+    flag,
+    out_of,
+    say,
+    score_apart,
+    told,
+)
 from taojax.verbs.resume import claimed
 
 if TYPE_CHECKING:
@@ -180,15 +188,13 @@ def _score_all(
 ) -> "list[Part]":
     """Score every folder, two at a time, each in a fresh interpreter."""
 
-    def score(job: _Job) -> None:
-        say(f"scoring {job.name}" + (" (with rivals)" if job.rival_logs else ""))
-        flags = ["--rivals", "--rival-logs", str(job.rival_logs)]
-        flags = [] if job.kind == "stress" else flags
-        score_apart(job.data, out / job.name, config, progress=progress, flags=flags)
+    def wanted() -> Iterator[Scoring]:
+        for job in jobs:
+            say(f"scoring {job.name}" + (" (with rivals)" if job.rival_logs else ""))
+            flags = ["--rivals", "--rival-logs", str(job.rival_logs)]
+            yield Scoring(job.data, out / job.name, [] if job.kind == "stress" else flags)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
-        # Asking for every result brings a failed run to light.
-        list(pool.map(score, jobs))
+    score_apart(wanted(), config, progress=progress, most=WORKERS)
     from taojax.audit.recovery_data import Part
 
     return [Part(job.kind, job.name, out / job.name, job.data / "truth") for job in jobs]

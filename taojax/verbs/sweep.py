@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from taojax.errors import InputError
-from taojax.verbs import child
-from taojax.verbs.common import Common, config_of, flag, out_of, say
+from taojax.verbs.common import Common, config_of, flag, out_of, run_apart, say
 
 if TYPE_CHECKING:
     from taojax.config import Config
@@ -57,11 +56,15 @@ def run(args: Sweep) -> None:
     truth = dataset / "truth" / "query_poses.csv"
     if args.judge and dataset.is_dir() and not truth.is_file():
         raise InputError(f"{truth}: no such file; add it, or add --no-judge")
-    if not args.judge:
-        _compute(dataset, out, config, grid, progress=args.progress)
-        return
-    if not is_sealed:
-        _compute_apart(dataset, out, config, grid, progress=args.progress)
+    try:
+        if not args.judge:
+            _compute(dataset, out, config, grid, progress=args.progress)
+            return
+        if not is_sealed:
+            _compute_apart(dataset, out, config, grid, progress=args.progress)
+    except KeyboardInterrupt:
+        say(f"taojax: interrupted; run the same command again to continue, with --out {out}")
+        raise SystemExit(130) from None
     from taojax.audit.sweep import evaluate_sweep
 
     print("\n".join(evaluate_sweep(out, dataset / "truth", config)))
@@ -87,11 +90,7 @@ def _world(out: Path, seed: int) -> Path:
 def _compute(dataset: Path, out: Path, config: "Config", grid: "Grid", *, progress: bool) -> None:
     from taojax.runtime.sweep_run import sweep
 
-    try:
-        manifest = sweep(dataset, out, config, grid, progress=progress)
-    except KeyboardInterrupt:
-        say(f"taojax: interrupted; run the same command again to continue, with --out {out}")
-        raise SystemExit(130) from None
+    manifest = sweep(dataset, out, config, grid, progress=progress)
     n, seal = manifest["n_configurations"], manifest["seal"][:12]
     say(f"sealed {n} configurations in {out}/signals.npz (seal {seal})")
 
@@ -110,10 +109,4 @@ def _compute_apart(
         words = ["sweep", str(dataset), "--out", str(out), "--config", str(settings)]
         words += ["--grid", str(values), "--no-judge"]
         words += ["--progress" if progress else "--no-progress"]
-        try:
-            # In a group of its own the child hears of an interrupt once, and says how to go on.
-            code = child.run(words, has_own_group=True)
-        except KeyboardInterrupt:
-            code = 130
-    if code:
-        raise SystemExit(code)
+        run_apart([words])
