@@ -248,11 +248,11 @@ def taken_together(data: Path, out: Path) -> list[int]:
     return sorted(child.returncode for child in both)
 
 
-def without_room(data: Path, out: Path, most_bytes: int) -> tuple[int, list[str]]:
-    """Score where no file may grow beyond some size."""
+def without_room(job: Job, data: Path, out: Path, most_bytes: int) -> tuple[int, list[str]]:
+    """Run a job where no file may grow beyond some size; return exit code and lines on stderr."""
 
     def limit() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
-    return finish(JOBS[0].words(data, out), preexec_fn=limit)
+    return finish(job.words(data, out), preexec_fn=limit)
