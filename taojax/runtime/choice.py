@@ -36,6 +36,10 @@ LOCAL_DELTAS = 3.0
 LOCAL_FRAMES = 1.5
 """Memory that picks the most exact of them, frames."""
 
+TIE = 1e-5
+"""Costs over `LOCAL_FRAMES` that differ by less are the same: where no new frame supports any branch,
+rounding would choose between them, and other versions of JAX round otherwise."""
+
 POSE_FRAMES = 2.0
 """Memory of the reported pose, frames: it must not lag behind where odometry drifts."""
 
@@ -160,7 +164,8 @@ def report(  # noqa: PLR0913 - one argument per thing looked at
     is_near = gap[:, 0] ** 2 + gap[:, 1] ** 2 < (LOCAL_DELTAS * params.delta_m) ** 2
     is_same = is_near & (jnp.cos(gap[:, 2]) > 0) & is_live
     local = over_frames(_fading(age, is_filled, LOCAL_FRAMES)[:, None] * branches.frame_cost.T)
-    exact = least(jnp.where(is_same, local, jnp.inf))
+    local = jnp.where(is_same, local, jnp.inf)
+    exact = jnp.where(local[chosen] <= jnp.min(local) + TIE, chosen, least(local))
     short = eqx.tree_at(lambda w: w.weight, window, _fading(age, is_filled, POSE_FRAMES))
 
     def now(row: Array) -> Float[Array, "3"]:
