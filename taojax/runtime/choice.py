@@ -37,8 +37,8 @@ LOCAL_FRAMES = 1.5
 """Memory that picks the most exact of them, frames."""
 
 TIE = 1e-5
-"""Costs over `LOCAL_FRAMES` that differ by less are the same: where no new frame supports any branch,
-rounding would choose between them, and other versions of JAX round otherwise."""
+"""Costs over `LOCAL_FRAMES` that differ by less are the same: where no new frame supports a branch,
+rounding would choose, and other versions of JAX round otherwise."""
 
 POSE_FRAMES = 2.0
 """Memory of the reported pose, frames: it must not lag behind where odometry drifts."""
