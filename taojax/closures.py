@@ -18,7 +18,7 @@ from taojax.detector import from_toml as read_detector
 from taojax.errors import InputError
 from taojax.records import Run
 from taojax.specs import fail, read_text
-from taojax.tables import MOTION, POSE, read_table, stacked
+from taojax.tables import MOTION, POSE, read_frames, read_table, stacked
 
 __all__ = ["Graph", "Verdicts", "build_graph", "g2o_text", "read_verdicts", "tum_text"]
 
@@ -109,13 +109,13 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
     path = folder / "verdicts.csv"
     if not path.is_file():
         return None
-    table = read_table(path, "verdicts")
+    table = read_frames(path, "verdicts", n_frames)
     try:
         seal = json.loads(read_text(folder / "audit.json"))["run_seal"]
     except (ValueError, KeyError, TypeError) as error:
         what = "does not say which run was judged"
         raise fail(folder / "audit.json", what, "judge the run again") from error
-    if seal != run.manifest["seal"] or len(table["frame"]) != n_frames:
+    if seal != run.manifest["seal"]:
         raise fail(path, "speaks of another run", "judge this one again with `taojax evaluate`")
     numbers = folder / "calibration.toml"
     detector = read_detector(numbers) if numbers.is_file() else None

@@ -177,6 +177,27 @@ def read_table(path: Path, name: str) -> dict[str, np.ndarray]:
     return table
 
 
+def read_frames(path: Path, name: str, n_frames: int) -> dict[str, np.ndarray]:
+    """Read a judge's table, which has a row for every frame of the run, in their order.
+
+    Args:
+        path: the file.
+        name: the spec in data_specs/.
+        n_frames: frames of the run.
+
+    Returns:
+        As `read_table`.
+
+    Raises:
+        InputError: malformed, or of other frames.
+    """
+    table = read_table(path, name)
+    if not np.array_equal(table["frame"], np.arange(n_frames)):
+        what = f"its frames are not the {n_frames} of signals.csv"
+        raise fail(path, what, "judge the run again with `taojax evaluate`")
+    return table
+
+
 def _layouts(spec: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     """Return the columns of every layout a table may have."""
     if "layouts" not in spec:

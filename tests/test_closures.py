@@ -213,6 +213,24 @@ def test_a_run_without_verdicts_says_what_to_do(scored, capsys):
     assert "taojax evaluate" in fails(capsys, "closures", str(scored / "first"))
 
 
+@pytest.mark.parametrize("name", ["labels.csv", "verdicts.csv"])
+@pytest.mark.parametrize("change", ["lost", "swapped"])
+def test_tables_of_other_frames_are_refused_before_anything_is_written(
+    name, change, scored, tmp_path, capsys
+):
+    folder, out = judged(scored, tmp_path / "run"), tmp_path / "elsewhere"
+    labels = [f"{t},in_map,1.0,test" for t in range(50)]
+    (folder / "labels.csv").write_text("\n".join(["frame,label,nearest_m,split", *labels]) + "\n")
+    assert main(["closures", str(folder), "--out", str(tmp_path / "whole")]) == 0
+    capsys.readouterr()
+    head, *rows = (folder / name).read_text().splitlines()
+    rows = rows[:-1] if change == "lost" else [rows[1], rows[0], *rows[2:]]
+    (folder / name).write_text("\n".join([head, *rows]) + "\n")
+    line = fails(capsys, "closures", str(folder), "--out", str(out))
+    assert f"{name}: its frames are not the 50 of signals.csv" in line
+    assert not out.exists()
+
+
 def test_without_verdicts_of_its_own_a_run_has_the_judges(scored, tmp_path, capsys):
     folder, out = judged(scored, tmp_path / "run"), tmp_path / "elsewhere"
     assert main(["closures", str(folder), "--out", str(out)]) == 0

@@ -14,7 +14,7 @@ from taojax.audit import bootstrap, metrics, tables
 from taojax.errors import InputError
 from taojax.records import read_run
 from taojax.specs import fail, read_bytes
-from taojax.tables import read_table
+from taojax.tables import read_frames, read_table
 
 SIGNALS = ("top1", "tao", tables.FUSED)
 SEPARATIONS = ("auroc", "far_at_95")
@@ -100,13 +100,10 @@ def read_judged(run: Path, name: str) -> Judged:
         raise fail(run, "no such run folder", "name one made by `taojax audit`")
     sealed = read_run(run)
     audit = _audit_json(run, sealed.manifest["seal"])
-    labels = read_table(run / "labels.csv", "labels")
-    verdicts = read_table(run / "verdicts.csv", "verdicts")
-    measured = read_table(run / "metrics.csv", "metrics")
     n = len(sealed.signals["frame"])
-    for file, table in (("labels.csv", labels), ("verdicts.csv", verdicts)):
-        if not np.array_equal(table["frame"], np.arange(n)):
-            raise fail(run / file, f"its frames are not the {n} of signals.csv", "judge again")
+    labels = read_frames(run / "labels.csv", "labels", n)
+    verdicts = read_frames(run / "verdicts.csv", "verdicts", n)
+    measured = read_table(run / "metrics.csv", "metrics")
     signals = {key: np.asarray(sealed.signals[key], float) for key in SIGNALS if key != "fused"}
     probability = np.asarray(verdicts["probability_map_out"], float)
     if not np.isnan(probability).any():

@@ -41,7 +41,7 @@ def run(args: Closures) -> None:
             " --calibration"
         )
     graph, folder = build_graph(args.run, sealed, verdicts), args.out or args.run
-    trajectory = tum_text(graph)
+    trajectory, told = tum_text(graph), _of_the_audit(args.run, verdicts)
     files = {
         "closures.g2o": g2o_text(graph, "accept"),
         "rejected.g2o": g2o_text(graph, "reject"),
@@ -59,7 +59,7 @@ def run(args: Closures) -> None:
     print(f"left out        {n['abstain']} on which nothing was decided, "
           f"{n_frames - n_posed} without a pose")  # fmt: skip
     print(f"trajectory.tum  {trajectory.count(chr(10))} accepted poses")
-    if told := _of_the_audit(args.run, verdicts):
+    if told:
         print(told)
     for note in sealed.manifest["notes"]:
         say(f"note: {note}")
@@ -68,11 +68,11 @@ def run(args: Closures) -> None:
 
 def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
     """Say how far accepted frames could be believed where the run was judged."""
-    from taojax.tables import read_table
+    from taojax.tables import read_frames
 
     if not (run / "labels.csv").is_file():
         return None
-    labels = read_table(run / "labels.csv", "labels")
+    labels = read_frames(run / "labels.csv", "labels", len(verdicts.verdict))
     accepted, where = verdicts.verdict == "accept", "all frames"
     if verdicts.source == "verdicts.csv":
         # Its numbers were fitted on the other half of the same run.
