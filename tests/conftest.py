@@ -10,8 +10,10 @@ from pathlib import Path
 # Subprocesses and tests share nothing but the CPU: no accelerator, no preallocation.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Commands are tried in fresh interpreters, which would compile the same programs over and over.
-# One folder per worker: JAX writes entries in place, and another could read half of one.
-os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="taojax-tests-")
+# Workers inherit the folder of the process that starts them.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="taojax-tests-")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 # The oldest JAX alarms at every entry that it reads, though it wrote it itself.
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
@@ -23,7 +25,6 @@ import pytest
 ALONE = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
 """For processes that compile side by side, or whose own compiling is what is tried."""
 
-atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

@@ -11,7 +11,8 @@ import pytest
 from taojax.cli import main
 from taojax.records import signal_names
 
-FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
+"""Rank compiles in a fraction of the time; what is tested does not depend on it."""
 VERBS = (
     "audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export", "convert",
     "inspect",

@@ -18,7 +18,7 @@ from taojax.detector import to_toml as detector_toml
 from taojax.runtime.score import score
 from taojax.verbs import rerun
 
-SMALL = Config(stream=StreamConfig(window=4, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
 
 PROCESSES = {
     "another process": {},
@@ -48,7 +48,7 @@ PATIENCE_S = 600
 def home(tmp_path_factory):
     """A data folder `data`, its sealed run `run`, and a calibration that can decide."""
     home = tmp_path_factory.mktemp("home")
-    write_folder(home / "data", np.random.default_rng(5), n_map=40, n_query=45)
+    write_folder(home / "data", np.random.default_rng(5))
     score(home / "data", home / "run", SMALL)
     one = np.ones(1)
     detector = Detector(("tao",), 0.5 * one, one, one, 0.0, 0.5, "made up")

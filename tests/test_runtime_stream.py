@@ -224,15 +224,6 @@ def test_standing_still_is_degenerate(rng):
     assert {STATUSES[s] for s in np.asarray(records.status)[5:]} == {"degenerate"}
 
 
-def test_a_long_drive_equals_a_fresh_start_on_the_same_window(rng):
-    tables, frames = log(rng, n=400)
-    _, long = replay(SMALL, tables, frames)
-    _, fresh = replay(SMALL, tables, jax.tree.map(lambda leaf: leaf[-SMALL.window :], frames))
-    np.testing.assert_allclose(
-        long.signals["tao_rank"][-1], fresh.signals["tao_rank"][-1], rtol=1e-5
-    )
-
-
 def test_rank_association_makes_tao_the_literal_cost(rng):
     tables, frames = log(rng)
     _, rank = replay(RANK, tables, frames)

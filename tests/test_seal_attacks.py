@@ -18,7 +18,7 @@ from taojax.errors import InputError
 from taojax.runtime import rivals
 from taojax.runtime.score import score
 
-SMALL = Config(stream=StreamConfig(window=4, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def home(tmp_path_factory):
     """A data folder, its sealed run, and the run of another drive."""
     home = tmp_path_factory.mktemp("home")
     for name, seed in (("data", 5), ("other_data", 6)):
-        write_folder(home / name, np.random.default_rng(seed), n_map=40, n_query=45)
+        write_folder(home / name, np.random.default_rng(seed))
     score(home / "data", home / "run", SMALL)
     score(home / "other_data", home / "other", SMALL)
     return home

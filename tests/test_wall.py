@@ -20,8 +20,9 @@ from taojax.errors import InputError
 from taojax.runtime.score import score
 
 ROOT = Path(taojax.__file__).parents[1]
-SMALL = Config(stream=StreamConfig(window=6, branches=5))
-FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
+"""Rank compiles in a fraction of the time; what is tested does not depend on it."""
 
 CHEATS = {
     "import at the top": ("runtime/stream.py", "import jax\n", "import jax\nimport taojax.audit\n"),
@@ -120,7 +121,7 @@ SCORE_TWICE = """
 from pathlib import Path
 from taojax.config import Config, StreamConfig
 from taojax.runtime.score import score
-config = Config(stream=StreamConfig(window=6, branches=5))
+config = Config(stream=StreamConfig(window=6, branches=5, association="rank"))
 for i, folder in enumerate({folders!r}):
     score(Path(folder), Path(f"run{{i}}"), config)
 """
