@@ -277,12 +277,13 @@ def read_run(run: Path) -> Run:
         InputError: a sealed file is missing, changed or malformed.
     """
     manifest = read_manifest(run)
-    carried = [name for name in CARRIED if name in manifest["sha256"]]
+    carried = {name: run / name for name in CARRIED if name in manifest["sha256"]}
     for name in (*SEALED, *carried):
         want, got = manifest["sha256"].get(name), digest_file(run / name)
         if got != want:
             what = f"seal broken: sha256 {got[:12]}... is not {str(want)[:12]}..."
             raise InputError(f"{run / name}: {what}; score the data set again")
+    decisions, tracks = carried.get("decisions.csv"), carried.get("tracks.npz")
     arrays = read_npz(run / "retrievals.npz", "retrievals")
     map_poses = read_table(run / "map_poses.csv", "map_poses")
     if arrays["index"].max() >= len(map_poses["t_s"]):
@@ -294,10 +295,6 @@ def read_run(run: Path) -> Run:
         similarity=arrays["similarity"],
         config_toml=(run / "config.toml").read_text(encoding="utf-8"),
         manifest=manifest,
-        decisions=read_table(run / "decisions.csv", "decisions")
-        if "decisions.csv" in carried
-        else None,
-        tracks=_read_tracks(run / "tracks.npz", manifest["tracks"])
-        if "tracks.npz" in carried
-        else None,
+        decisions=decisions and read_table(decisions, "decisions"),
+        tracks=tracks and _read_tracks(tracks, manifest["tracks"]),
     )

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 import pytest
 
-ALONE = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+ALONE = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
 """For processes that compile side by side, or whose own compiling is what is tried."""
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -38,7 +38,7 @@ def trials():
 
 
 @pytest.mark.parametrize(
-    ("association", "batch"), [("rank", 1), ("rank", 2), ("rank", None), ("joint", 1)]
+    ("association", "batch"), [("rank", 1), ("rank", 2), ("rank", None), ("joint", 2)]
 )
 def test_trials_equal_separate_replays(association, batch, trials):
     tables, frames = trials

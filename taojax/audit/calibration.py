@@ -52,6 +52,9 @@ _TINY = 1e-9  # below it a signal is constant and says nothing
 LEAST_PER_CLASS = 5
 """Frames of each class below which the model is called a fallback."""
 
+FALLBACK = "The probability is a fallback"
+"""So begins the note of a detector that had too few frames to be fitted."""
+
 
 def prior(map_recall: float) -> dict[str, float]:
     """Return the prior weights that the map alone suggests.
@@ -71,7 +74,7 @@ def _note(n_in: int, n_out: int) -> str:
             f"prior that the map alone sets, and fitted on {counts}."
         )
     return (
-        f"The probability is a fallback, because there are only {counts} and two classes of at "
+        f"{FALLBACK}, because there are only {counts} and two classes of at "
         f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the prior's, so "
         "it ranks frames, but its level is not calibrated."
     )

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from taojax.audit.calibration import FALLBACK
 from taojax.audit.counts import (
     LEFT_IN,
     LEFT_OUT,
@@ -23,9 +24,6 @@ MAIN = ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused")
 """Signals that are told first; the others stand in the files."""
 
 _MOST = 0.5  # beyond this share a rate is called "most"
-
-FALLBACK = "The probability is a fallback"
-"""So begins the note of a detector that had too few frames to be fitted."""
 
 TOO_SHORT = "The recording is too short to hold a test split: nothing is scored out of sample."
 BLIND = "The calibration split holds no in-map frame, so there is no threshold."

@@ -179,8 +179,9 @@ def odometry(
     page.say("steps", f"{moved.median_m:.2f} m median, the longest {largest}")
     if drift is not None:
         page.say("drift", f"{drift:.2g} m from the truth over {WINDOW} frames (median)")
+    is_off = scale is not None and not 1 / 3 <= scale <= 3
     page.warn(
-        scale is not None and not 1 / 3 <= scale <= 3,
+        is_off,
         f"odometry is {scale or 0:.3g} times {what}: are its rows metres from frame to frame, or"
         " poses (`taojax convert files --odometry-kind poses`)?",
     )
@@ -194,8 +195,8 @@ def odometry(
         moved.largest_yaw_rad > 1.01 * np.pi,
         f"a frame turns by {moved.largest_yaw_rad:.0f} rad: is dtheta_rad in degrees?",
     )
-    is_motion = truth is None or scale is None or 1 / 3 <= scale <= 3
-    return drift if is_motion else NO_MOTION
+    # The way of the map is a hint alone: a drive may be shorter.
+    return NO_MOTION if is_off and truth is not None else drift
 
 
 def radii(page: Page, proposed: Radii, nearest_m: "np.ndarray | None") -> str:
