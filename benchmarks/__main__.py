@@ -1,6 +1,7 @@
 """The command line of the benchmarks; imports happen inside the verbs, so that help is fast."""
 
 import argparse
+import importlib
 import sys
 import time
 from pathlib import Path
@@ -28,6 +29,7 @@ def _parser() -> argparse.ArgumentParser:
     progress.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     gallery = verbs.add_parser("gallery", help="the README's sheet of figures")
     gallery.add_argument("--out", type=Path, help="folder to make (default runs/gallery/TIME)")
+    verbs.add_parser("notebooks", help="executes the notebooks and keeps their figures")
     refinement = verbs.add_parser("refinement", help="what the true Huber minimum buys and costs")
     refinement.add_argument("--quick", action="store_true", help="500 windows instead of 10,000")
     refinement.add_argument(
@@ -63,6 +65,11 @@ def _reliability(out: Path, *, quick: bool, only: str) -> int:
 def main(arguments: list[str] | None = None) -> int:
     """Run one verb and return the exit code."""
     args = _parser().parse_args(arguments)
+    if args.verb == "notebooks":
+        from benchmarks import notebooks
+
+        notebooks.run()
+        return 0
     out = args.out or Path("runs") / args.verb / time.strftime("%Y%m%d-%H%M%S")
     if out.exists() and any(out.iterdir()):
         print(f"{out} is not empty: choose another --out", file=sys.stderr)
@@ -75,18 +82,12 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import progress
 
         progress.run(out, args.data)
-    elif args.verb == "gallery":
-        from benchmarks import gallery
-
-        gallery.run(out)
+    elif args.verb in ("gallery", "sweep_speed"):
+        importlib.import_module(f"benchmarks.{args.verb}").run(out)
     elif args.verb == "refinement":
         from benchmarks import refinement
 
         refinement.run(out, args.data, quick=args.quick)
-    elif args.verb == "sweep_speed":
-        from benchmarks import sweep_speed
-
-        sweep_speed.run(out)
     elif args.verb == "speed":
         from benchmarks import speed
 

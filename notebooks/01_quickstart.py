@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -18,8 +19,8 @@
 
 # %%
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from taojax import STATUSES, Frame, StreamConfig, init, map_tables, step
 from taojax.datasets.edit import scenario
@@ -67,13 +68,12 @@ print(STATUSES[int(last.status)], np.round(np.asarray(last.pose), 2), int(last.m
 gap = world.query_poses[:300, None, 1:3] - world.map_poses[None, :, 1:3]
 is_off = np.sqrt((gap**2).sum(-1)).min(axis=1) > 10.0
 tao = np.array([float(record.signals["tao"]) for record in records])
-figure = Figure(figsize=(9, 3), layout="constrained")
-ax = figure.subplots()
+figure, ax = plt.subplots(figsize=(9, 3), layout="constrained")
 ax.plot(tao, color="#0072B2", linewidth=1.0)
 ax.fill_between(range(300), 0, 1, where=is_off, color="#999999", alpha=0.3,
                 transform=ax.get_xaxis_transform(), linewidth=0)  # fmt: skip
 ax.set(xlabel="query frame", ylabel="tao [1]", title="simulated")
-figure
+plt.show()
 
 # %%
 inside, outside = float(np.median(tao[~is_off])), float(np.median(tao[is_off]))

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -17,8 +18,8 @@
 
 # %%
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from taojax import STATUSES, Config, Frame, map_tables
 from taojax.audit.recovery import frames_to_recovery
@@ -66,14 +67,13 @@ print(f"{np.isfinite(found).mean():.0%} of {len(found)} recovered, median {np.me
 status = np.array(STATUSES)[records.status.reshape(rows.shape)]
 stale = records.signals["stale"].reshape(rows.shape)
 believed = (status == "ok") & (stale == 0)
-figure = Figure(figsize=(9, 3), layout="constrained")
-ax = figure.subplots()
+figure, ax = plt.subplots(figsize=(9, 3), layout="constrained")
 ax.semilogy(error[0] + 0.1, color="#0072B2", linewidth=1.0)
 ax.plot(np.flatnonzero(believed[0]), error[0][believed[0]] + 0.1, ".", color="#009E73")
 for jump in logs[0].kidnaps:
     ax.axvline(jump, color="#D55E00", linestyle="--", linewidth=1.0)
 ax.set(xlabel="frame of the log", ylabel="error [m]", title="simulated; green: may be believed")
-figure
+plt.show()
 
 # %%
 wrong = float((believed & (error > 10.0)).sum() / len(found))

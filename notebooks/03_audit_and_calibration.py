@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -18,8 +19,8 @@
 
 # %%
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from taojax import Config, Frame, detector, map_tables
 from taojax.audit import calibration, labels, metrics
@@ -74,6 +75,6 @@ print(f"test half: AUROC {auroc:.3f}, {far:.1%} of map-out accepted, {frr:.1%} o
 
 # %%
 bins = calibration.reliability(p[known], test.is_out[known])
-figure = Figure(figsize=(4, 4), layout="constrained")
-reliability_diagram(bins.promised, bins.realised, bins.n_frames, ax=figure.subplots())
-figure
+figure, ax = plt.subplots(figsize=(4, 4), layout="constrained")
+reliability_diagram(bins.promised, bins.realised, bins.n_frames, ax=ax)
+plt.show()

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -22,8 +23,8 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
 from taojax import Frame, StreamConfig, map_tables, replay
 from taojax.audit import labels, metrics
@@ -67,14 +68,14 @@ table = np.array([metrics.auroc(row, is_off[:500]) for row in signals]).reshape(
 # the retrieval. A huge gamma turns the cost into a smoothed similarity.
 
 # %%
-figure = Figure(figsize=(4.5, 3.6), layout="constrained")
-ax = figure.subplots()
+figure, ax = plt.subplots(figsize=(4.5, 3.6), layout="constrained")
 image = ax.imshow(table, cmap="viridis")
 ax.set(xticks=range(4), xticklabels=gammas, yticks=range(4), yticklabels=weights,
        xlabel="gamma [m²]", ylabel="lambda", title="AUROC, first half, simulated")  # fmt: skip
 for (row, column), value in np.ndenumerate(table):
-    ax.text(column, row, f"{value:.2f}", ha="center", va="center", color="white")
-figure
+    ink = "white" if value < table.mean() else "black"
+    ax.text(column, row, f"{value:.2f}", ha="center", va="center", color=ink)
+plt.show()
 
 # %% [markdown]
 # The chosen pair, judged once on the second half, beside the default:

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -20,8 +21,9 @@
 
 # %%
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
+import pandas as pd
 from sklearn.metrics import roc_auc_score
 
 from taojax import Config, Frame, map_tables
@@ -62,26 +64,26 @@ truth = {name: off_map(world) for name, world in worlds.items()}
 # The area under the ROC curve of each signal, over all frames (simulated):
 
 # %%
-scores = {
+scores = pd.DataFrame({
     name: {s: roc_auc_score(truth[name], records[name].signals[s]) for s in SIGNALS}
     for name in worlds
-}
-scores
+})  # fmt: skip
+scores.round(3)
 
 # %% [markdown]
 # The same as a picture: grey is off the map. Where places alias, the similarity does not move when
 # the robot leaves the map; the cost of the best alignment does.
 
 # %%
-figure = Figure(figsize=(9, 6), layout="constrained")
-for row, name in zip(figure.subplots(2, 2, sharex=True).T, worlds, strict=True):
+figure, axes = plt.subplots(2, 2, figsize=(9, 6), sharex=True, layout="constrained")
+for row, name in zip(axes.T, worlds, strict=True):
     for ax, signal in zip(row, ("top1_w10", "tao"), strict=True):
         ax.plot(records[name].signals[signal], linewidth=1.0, color="#0072B2")
         ax.fill_between(range(len(truth[name])), 0, 1, where=truth[name], color="#999999",
                         alpha=0.3, transform=ax.get_xaxis_transform(), linewidth=0)  # fmt: skip
         ax.set(ylabel=f"{signal} [1]", title=name if signal == "top1_w10" else "")
     ax.set_xlabel("query frame")
-figure
+plt.show()
 
 # %% [markdown]
 # Where geometry cannot help: at a radius of a few metres. An answer that is wrong by less than the
@@ -92,4 +94,4 @@ name = "level separates"
 error = np.hypot(*(records[name].pose[:, :2] - worlds[name].query_poses[:, 1:3]).T)
 inside = ~truth[name] & records[name].has_pose
 near = {s: roc_auc_score(error[inside] > 5.0, records[name].signals[s][inside]) for s in SIGNALS}
-near
+pd.Series(near).round(3)

@@ -1,6 +1,7 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
@@ -17,13 +18,18 @@
 # anything is judged.
 
 # %%
+import os
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
+from taojax import read_run
 from taojax.cli import main
 from taojax.datasets.simulate import WorldConfig, make_world
+
+os.chdir(tempfile.mkdtemp())  # all that is written below
 
 # %% [markdown]
 # ## Descriptors of thermal images (AnyThermal with SALAD)
@@ -62,11 +68,26 @@ def unit(rows):
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
+# %% [markdown]
+# A made-up scene, warmer towards the ground and with one warm thing in it. Left the whole range,
+# right what the network should see.
+
 # %%
-counts = np.random.default_rng(0).normal(3300, 120, (512, 640)).astype(np.uint16)
+row, column = np.mgrid[:512, :640]
+scene = 3300 + 0.4 * row + 150 * (np.hypot(row - 330, column - 430) < 60)
+counts = np.random.default_rng(0).normal(scene, 6).astype(np.uint16)
 gray = eight_bit(counts)
 print(f"counts {counts.min()} to {counts.max()} -> {gray.min()} to {gray.max()}")
 print(network_input(gray).shape)
+
+# %%
+figure, axes = plt.subplots(1, 2, figsize=(7, 3), layout="constrained")
+for ax, image, title in zip(
+    axes, (counts >> 6, gray), ("14 bits to 8", "1 % to 99 %"), strict=True
+):
+    ax.imshow(image, cmap="gray", vmin=0, vmax=255)
+    ax.set(xticks=[], yticks=[], title=f"{title}, made up")
+plt.show()
 
 # %% [markdown]
 # ## A plain folder
@@ -76,8 +97,7 @@ print(network_input(gray).shape)
 # simulated world.
 
 # %%
-root = Path(tempfile.mkdtemp())
-mine = root / "mine"
+mine = Path("mine")
 world = make_world(WorldConfig(n_map=400, n_query=200, driven_m=1200.0, loop_m=900.0), seed=0)
 for side, poses in (("map/poses.csv", world.map_poses), ("query/poses.csv", world.query_poses)):
     (mine / side).parent.mkdir(parents=True)
@@ -94,17 +114,16 @@ def as_tum(poses):
 
 
 # %%
-np.savetxt(root / "odometry.tum", as_tum(world.query_poses), "%.9f")
+np.savetxt("odometry.tum", as_tum(world.query_poses), "%.9f")
 
 # %% [markdown]
 # On the command line: `taojax convert folder mine data --odometry odometry.tum --odometry-kind
 # tum`. Public data sets have converters of their own: `taojax convert --help`.
 
 # %%
-data = root / "data"
-words = ["convert", "folder", str(mine), str(data)]
-converted = main([*words, "--odometry", str(root / "odometry.tum"), "--odometry-kind", "tum"])
-print(*sorted(str(path.relative_to(data)) for path in data.rglob("*.*")), sep="\n")
+words = ["convert", "folder", "mine", "data"]
+converted = main([*words, "--odometry", "odometry.tum", "--odometry-kind", "tum"])
+print(*sorted(str(path) for path in Path("data").rglob("*.*")), sep="\n")
 
 # %% [markdown]
 # ## Look before you judge
@@ -112,8 +131,25 @@ print(*sorted(str(path.relative_to(data)) for path in data.rglob("*.*")), sep="\
 # `taojax inspect` checks every file and says in plain words what to expect.
 
 # %%
-inspected = main(["inspect", str(data)])
-inspected
+inspected = main(["inspect", "data"])
+
+# %% [markdown]
+# Your own eyes see more than any check: the map, and how alike each query image finds each place
+# (bright = alike; the dots are where it truly was).
+
+# %%
+alike = unit(world.query_descriptors) @ unit(world.map_descriptors).T
+gap = world.query_poses[:, None, 1:3] - world.map_poses[None, :, 1:3]
+figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+left.plot(*world.map_poses[:, 1:3].T, ".", color="#999999", markersize=4, label="map")
+left.plot(*world.query_poses[:, 1:3].T, color="#0072B2", linewidth=1.0, label="query")
+left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="simulated")
+left.legend(frameon=False)
+right.imshow(alike, cmap="gray", aspect="auto", interpolation="nearest")
+right.plot(np.hypot(*gap.T).argmin(axis=0), np.arange(len(alike)), ".", color="#D55E00",
+           markersize=2)  # fmt: skip
+right.set(xlabel="map image", ylabel="query frame", title="similarity [1]")
+plt.show()
 
 # %% [markdown]
 # From here on: `taojax audit data --r-in 5 --r-out 10`.
@@ -128,11 +164,10 @@ inspected
 # real descriptors.
 
 # %%
-from taojax.audit.judgement import judge
-from taojax.audit.truth import read_truth
+from taojax.audit.evaluate import evaluate
 from taojax.config import AuditConfig, Config
 from taojax.datasets.progress import ProgressConfig, route_of_shares, write_progress
-from taojax.records import read_run
+from taojax.plots import signal_trace
 from taojax.runtime.score import score
 
 rng = np.random.default_rng(1)
@@ -141,25 +176,50 @@ places = sum(steps[k : k + 300] for k in range(5)).astype(np.float32)
 seen = (places + rng.normal(0, 3.5, places.shape)).astype(np.float32)
 
 # %%
-with tempfile.TemporaryDirectory() as scratch:
-    route, run = Path(scratch) / "route", Path(scratch) / "run"
-    write_progress(route, route_of_shares(places, seen), ProgressConfig(), seed=0)
-    config = Config(audit=AuditConfig(r_in_m=2.0, r_out_m=10.0, n_bootstrap=50))  # rows
-    score(route, run, config)
-    judged = judge(read_run(run), read_truth(route / "truth", 300), config)
+route = Path("route")
+write_progress(route, route_of_shares(places, seen), ProgressConfig(), seed=0)
+config = Config(audit=AuditConfig(r_in_m=2.0, r_out_m=10.0, n_bootstrap=50))  # rows
+score(route, Path("run"), config)
+found = evaluate(Path("run"), route / "truth", config)
+print(*found.sentences, sep="\n")
 
 # %% [markdown]
-# The literal cost, the similarity gates and the joint cost, over all labelled frames:
+# `read_run` hands out all tables of a run folder, whoever wrote it, as pandas: `signals`, `labels`
+# and `verdicts` by frame, `metrics` by signal. The similarity gates, the literal cost and the joint
+# cost, over all labelled frames:
 
 # %%
-auroc = dict(zip(judged.metrics["signal"], judged.metrics["auroc"], strict=True))
-{name: round(float(auroc[name]), 3) for name in ("top1", "top1_w10", "tao_rank", "tao")}
+run = read_run("run")
+run.metrics.loc[["top1", "top1_w10", "tao_rank", "tao"], ["auroc", "aupr_out", "far_at_95"]].round(
+    3
+)
+
+# %% [markdown]
+# What was decided (rows) of what truly was (columns), on the second half:
+
+# %%
+frames = run.labels.join(run.verdicts)
+frames[frames["split"] == "test"].groupby(["verdict", "label"]).size().unstack(fill_value=0)
+
+# %%
+figure, ax = plt.subplots(figsize=(9, 3), layout="constrained")
+is_out, half = (
+    (run.labels["label"] == "map_out").to_numpy(),
+    run.labels["split"].eq("test").argmax(),
+)
+level = float(run.metrics.loc["tao", "threshold"])
+signal_trace(run.signals["tao"].to_numpy(), is_out, name="tao [1]", threshold=level,
+             test_start=int(half), ax=ax)  # fmt: skip
+ax.set(xlabel="query frame", title="simulated odometry, made-up descriptors")
+ax.legend(frameon=False, fontsize=8, ncols=4)
+plt.show()
 
 # %% [markdown]
 # A straight window is not a degenerate one: every frame after the first two has an answer. Its
 # volume is zero by nature, so that `c_geom` and `h_proxy` say nothing on a route.
 
 # %%
-statuses, counts = np.unique(judged.signals["status"].astype(str), return_counts=True)
-found = {str(s): int(n) for s, n in zip(statuses, counts, strict=True)}
-found, float(auroc["c_geom"]), float(auroc["h_proxy"])
+run.signals["status"].value_counts()
+
+# %%
+run.metrics.loc[["c_geom", "h_proxy"], ["auroc"]]

@@ -1,7 +1,8 @@
 """taojax: am I lost, or just somewhere new, and may this loop closure enter my graph?
 
-The names a robot program needs. They are loaded on first use, so that importing the package costs
-nothing; none of them knows the judge.
+The names a robot program needs, and `read_run`, which hands the tables of a run folder to people.
+They are loaded on first use, so that importing the package costs nothing; none of them knows the
+judge.
 """
 
 import importlib
@@ -12,6 +13,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from taojax.config import Config, StreamConfig
     from taojax.errors import ConfigError, InputError, TaojaxError
+    from taojax.results import Results, read_run
     from taojax.runtime.frames import STATUSES, Frame, StreamRecord
     from taojax.runtime.maps import MapTables, map_tables
     from taojax.runtime.stream import StreamState, init, replay, step
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "taojax.config": ("Config", "StreamConfig"),
     "taojax.errors": ("ConfigError", "InputError", "TaojaxError"),
+    "taojax.results": ("Results", "read_run"),
     "taojax.runtime.maps": ("MapTables", "map_tables"),
     "taojax.runtime.frames": ("STATUSES", "Frame", "StreamRecord"),
     "taojax.runtime.stream": ("StreamState", "init", "replay", "step"),
@@ -31,6 +34,7 @@ __all__ = [
     "Frame",
     "InputError",
     "MapTables",
+    "Results",
     "StreamConfig",
     "StreamRecord",
     "StreamState",
@@ -38,6 +42,7 @@ __all__ = [
     "__version__",
     "init",
     "map_tables",
+    "read_run",
     "replay",
     "step",
 ]

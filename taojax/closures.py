@@ -86,6 +86,22 @@ class Graph(NamedTuple):
         return np.flatnonzero((self.verdict == verdict) & (self.map_index >= 0))
 
 
+def refuse_foreign(folder: Path, run: Run) -> None:
+    """Check that a judge's folder speaks of this run and no other.
+
+    Raises:
+        InputError: its audit.json is missing or malformed, or names another seal.
+    """
+    try:
+        seal = json.loads(read_text(folder / "audit.json"))["run_seal"]
+    except (ValueError, KeyError, TypeError) as error:
+        what = "does not say which run was judged"
+        raise fail(folder / "audit.json", what, "judge the run again") from error
+    if seal != run.manifest["seal"]:
+        fix = "judge this one again with `taojax evaluate`"
+        raise fail(folder / "verdicts.csv", "speaks of another run", fix)
+
+
 def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
     """Read what was decided: sealed at run time, else by the judge.
 
@@ -110,13 +126,7 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
     if not path.is_file():
         return None
     table = read_frames(path, "verdicts", n_frames)
-    try:
-        seal = json.loads(read_text(folder / "audit.json"))["run_seal"]
-    except (ValueError, KeyError, TypeError) as error:
-        what = "does not say which run was judged"
-        raise fail(folder / "audit.json", what, "judge the run again") from error
-    if seal != run.manifest["seal"]:
-        raise fail(path, "speaks of another run", "judge this one again with `taojax evaluate`")
+    refuse_foreign(folder, run)
     numbers = folder / "calibration.toml"
     detector = read_detector(numbers) if numbers.is_file() else None
     p = table["probability_map_out"].astype(float)
