@@ -20,6 +20,11 @@ def _parser() -> argparse.ArgumentParser:
     quality.add_argument("--out", type=Path, help="folder to make (default runs/quality/TIME)")
     quality.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     quality.add_argument("--only", default="", help="only data sets whose name contains this")
+    verdict = verbs.add_parser("verdict", help="verdicts on recordings left out; makes the default")
+    verdict.add_argument("--out", type=Path, help="folder to make (default runs/verdict/TIME)")
+    verdict.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
+    verdict.add_argument("--only", default="", help="only recordings whose name contains this")
+    verdict.add_argument("--write", action="store_true", help="replace the default calibration")
     ablation = verbs.add_parser("ablation", help="what each ingredient is worth")
     ablation.add_argument("--out", type=Path, help="folder to make (default runs/ablation/TIME)")
     ablation.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
@@ -78,6 +83,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import ablation
 
         ablation.run(out, args.data, only=args.only)
+    elif args.verb == "verdict":
+        from benchmarks import verdict
+
+        verdict.run(out, args.data, only=args.only, write=args.write)
     elif args.verb == "progress":
         from benchmarks import progress
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from taojax import detector
+from taojax import risk
 from taojax.core.procrustes import fit_se2
 from taojax.core.se2 import transform
 from taojax.plots import IN_MAP, INK, MAP_OUT, PALE
@@ -87,9 +87,9 @@ def radii() -> Figure:
 def level(run: Path) -> Figure:
     """Draw how a level is frozen on one half of a judged run and used on the other."""
     frames, said = (read_table(run / f"{name}.csv", name) for name in ("labels", "verdicts"))
-    p = np.clip(said["probability_map_out"].astype(float), 1e-4, 1 - 1e-4)
+    p = np.clip(said["probability_wrong"].astype(float), 1e-4, 1 - 1e-4)
     odds = np.log(p) - np.log1p(-p)
-    frozen = detector.from_toml(run / "calibration.toml").threshold
+    frozen = risk.from_toml(run / "calibration.toml").final.level
     at = np.log(frozen) - np.log1p(-frozen)
     edges = np.linspace(-7.0, 9.5, 34)
     figure = Figure(figsize=(8.6, 3.4), layout="constrained")
@@ -103,8 +103,10 @@ def level(run: Path) -> Figure:
             chosen = (frames["label"] == label) & (frames["split"] == part)
             style = "stepfilled" if label == "in_map" else "step"
             ax.hist(odds[chosen], edges, histtype=style, color=colour, label=name, linewidth=1.8)
-        ax.axvline(at, color=INK, linestyle="--", label="frozen: 95 % of the first half's blue")
-        ax.set_xlabel("log odds of being off the map")
+        ax.axvline(
+            at, color=INK, linestyle="--", label="frozen: the highest level that keeps the promise"
+        )
+        ax.set_xlabel("log odds that the final answer is wrong")
         ax.set_title(title, fontsize=10)
     first = figure.axes[0]
     first.set(ylabel="frames", ylim=(0, 1.25 * first.get_ylim()[1]))

@@ -150,7 +150,10 @@ def measure(route: Route, settings: ProgressConfig, seed: int, config: Config) -
     # place of the probability.
     others = {entry.name: entry.signal for entry in said}
     splits = _cut(judgement, others | {tables.FUSED: _single_view(judgement)})
-    beside = tables.metrics_table(others, judgement.label, splits, config.audit, config.seed)
+    tested = judgement.answers.at(splits.test.frame)
+    beside = tables.metrics_table(
+        others, judgement.label, splits, tested, config.audit, config.seed
+    )
     rows = {}
     for table, fused in ((judgement.metrics, "joint"), (beside, "single_view")):
         for at, signal in enumerate(table["signal"]):

@@ -119,26 +119,24 @@ def load(folder: Path, out: Path) -> list[np.ndarray]:
 
 def _settings(folder: Path) -> None:
     from taojax.config import Config, to_toml
-    from taojax.detector import Detector
-    from taojax.detector import to_toml as detector_toml
+    from taojax.risk import shipped
+    from taojax.risk import to_toml as calibration_toml
 
     (folder / "config.toml").write_text(to_toml(Config()))
     (folder / "grid.toml").write_text("lambda_velocity = [0.1, 1]\n[joint]\nmemory_frames = [10]\n")
-    one = np.ones(2)
-    detector = Detector(("tao", "top1"), one, one, one, 0.0, 0.5, "fitted")
-    (folder / "calibration.toml").write_text(detector_toml(detector))
+    (folder / "calibration.toml").write_text(calibration_toml(shipped()))
 
 
 def _read_settings(folder: Path, out: Path) -> list[np.ndarray]:
     from taojax.config import from_toml
-    from taojax.detector import from_toml as detector_of
+    from taojax.risk import from_toml as calibration_of
     from taojax.runtime.grid import expand, read_grid
 
     config = from_toml(folder / "config.toml")
     rows = expand(read_grid(folder / "grid.toml"), config.stream)
-    detector = detector_of(folder / "calibration.toml")
+    final = calibration_of(folder / "calibration.toml").final
     numbers = [float(v) for row in rows for v in row.values() if not isinstance(v, str)]
-    return [np.array(numbers), detector.mean, detector.scale, detector.weight]
+    return [np.array(numbers), final.mean, final.scale, final.weight]
 
 
 def own_files() -> list[Target]:

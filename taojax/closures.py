@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from taojax.config import StreamConfig, from_toml
-from taojax.detector import Detector
-from taojax.detector import from_toml as read_detector
 from taojax.errors import InputError
 from taojax.records import Run
+from taojax.risk import Calibration
+from taojax.risk import from_toml as read_calibration
 from taojax.specs import fail, read_text
 from taojax.tables import MOTION, POSE, read_frames, read_table, stacked
 
@@ -42,16 +42,28 @@ class Verdicts(NamedTuple):
     """The file that says so."""
 
     verdict: Shaped[np.ndarray, " t"]
-    """accept, reject or abstain."""
+    """accept, reject or abstain, finally."""
 
     probability: Float[np.ndarray, " t"]
-    """Of being off the map; NaN where the file leaves it blank."""
+    """That the final answer is wrong."""
 
-    reason: Shaped[np.ndarray, " t"] | None
-    """In words; None where the file has none."""
+    reason: Shaped[np.ndarray, " t"]
+    """In words."""
 
-    detector: Detector | None
-    """The frozen numbers behind the verdicts; None where no threshold could be set."""
+    pose: Float[np.ndarray, "t 3"]
+    """The final answer: x [m], y [m], theta [rad]; NaN without one."""
+
+    map_index: Int[np.ndarray, " t"]
+    """Its map row, -1 without one."""
+
+    verdict_now: Shaped[np.ndarray, " t"]
+    probability_now: Float[np.ndarray, " t"]
+    reason_now: Shaped[np.ndarray, " t"]
+    pose_now: Float[np.ndarray, "t 3"]
+    """The causal verdict and answer."""
+
+    calibration: Calibration
+    """The frozen numbers behind the verdicts."""
 
 
 class Graph(NamedTuple):
@@ -103,7 +115,7 @@ def refuse_foreign(folder: Path, run: Run) -> None:
 
 
 def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
-    """Read what was decided: sealed at run time, else by the judge.
+    """Read what was decided: by the judge, who knows this place, else sealed at run time.
 
     Args:
         folder: the run.
@@ -115,22 +127,27 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
     Raises:
         InputError: a file is malformed, or speaks of another run.
     """
-    hashes, n_frames = run.manifest["sha256"], len(run.signals["frame"])
-    if "decisions.csv" in hashes:
-        table = read_table(folder / "decisions.csv", "decisions")
-        has_numbers = "detector.toml" in hashes
-        detector = read_detector(folder / "detector.toml") if has_numbers else None
-        p = table["probability_map_out"].astype(float)
-        return Verdicts("decisions.csv", table["verdict"], p, None, detector)
-    path = folder / "verdicts.csv"
-    if not path.is_file():
+    path, numbers = folder / "verdicts.csv", folder / "calibration.toml"
+    if path.is_file():
+        refuse_foreign(folder, run)
+        table = read_frames(path, "verdicts", len(run.signals["frame"]))
+    elif run.decisions is not None:
+        path, numbers, table = folder / "decisions.csv", folder / "detector.toml", run.decisions
+    else:
         return None
-    table = read_frames(path, "verdicts", n_frames)
-    refuse_foreign(folder, run)
-    numbers = folder / "calibration.toml"
-    detector = read_detector(numbers) if numbers.is_file() else None
-    p = table["probability_map_out"].astype(float)
-    return Verdicts("verdicts.csv", table["verdict"], p, table["reason"], detector)
+    return Verdicts(
+        path.name,
+        table["verdict"],
+        table["probability_wrong"],
+        table["reason"],
+        stacked(table, POSE),
+        table["map_index"].astype(int),
+        table["verdict_now"],
+        table["probability_wrong_now"],
+        table["reason_now"],
+        stacked(table, ("x_now_m", "y_now_m", "theta_now_rad")),
+        read_calibration(numbers),
+    )
 
 
 def _wrap(angle: np.ndarray | float) -> np.ndarray:
@@ -190,8 +207,7 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
         raise InputError(f"{folder}: {what}; score the data set again with `taojax score`")
     table = read_table(folder / "odometry.csv", "query_odometry")
     odometry = stacked(table, MOTION)
-    signals, poses = run.signals, run.map_poses
-    pose = stacked(signals, POSE)
+    poses, pose = run.map_poses, verdicts.pose
     is_accepted = (verdicts.verdict == "accept") & np.isfinite(pose[:, 0])
     n = len(odometry)
     is_start = np.arange(n) % (facts.get("trial_frames") or n) == 0
@@ -205,7 +221,7 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
         odometry=odometry,
         is_start=is_start,
         pose=pose,
-        map_index=signals["map_index"].astype(int),
+        map_index=verdicts.map_index,
         verdict=verdicts.verdict,
         sigma_m=delta * spacing_m,
         sigma_rad=delta / settings.window,

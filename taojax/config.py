@@ -86,6 +86,66 @@ class StreamConfig(eqx.Module):
             _check_range(name, getattr(self, name), 1e-30)
 
 
+class VerdictConfig(eqx.Module):
+    """The filter over the map's anchors that says whether an answer is right; robot side.
+
+    Lengths are in gaps (median distance between neighbouring map poses), so that a map in other
+    units gives the same verdicts. Each default was set by leaving whole recordings out
+    (`python -m benchmarks verdict`).
+    """
+
+    lag: int = eqx.field(static=True, default=20)
+    """*shape*. Frames that a final verdict may wait for, 0 to 1,000. Where frames are dense (less
+    than half a gap apart) it is what travels as far, up to five times as many frames."""
+
+    window_frames: int = eqx.field(static=True, default=20)
+    """*shape*. Frames on either side by which an answer is tried, counted as the lag is, 4 to
+    1,000; a short window is a quarter of it, a long one reaches three times as far back."""
+
+    evidence: Scalar = 4.0
+    """Log likelihood ratio of a strong match against background, per whole piece of evidence,
+    > 0."""
+
+    most_unit_gaps: Scalar = 4.0
+    """A frame counts by the way since the last one over the way in which the map's descriptors
+    change (their correlation length), which is capped at so many gaps, >= 1."""
+
+    leave: Scalar = 0.02
+    """Probability of leaving the map per unit of way, in (0, 1)."""
+
+    come_back: Scalar = 0.1
+    """Probability of coming back onto it, anywhere, per unit of way, in (0, 1)."""
+
+    start_off: Scalar = 0.3
+    """Probability of starting off the map, in (0, 1)."""
+
+    step_gaps: Scalar = 1.0
+    """Motion is gathered up to so many gaps before the belief moves, > 0."""
+
+    reach_gaps: Scalar = 2.0
+    """Who would have come from farther than this from every anchor came from off the map, > 0."""
+
+    place_gaps: Scalar = 4.0
+    """Hypotheses within so many gaps of the likeliest are one place, > 0."""
+
+    near_gaps: Scalar = 2.0
+    """A candidate this near to where an answer predicts it agrees with the answer, gaps, > 0."""
+
+    drift: Scalar = 0.05
+    """That distance grows by this share of the way driven in between, >= 0."""
+
+    def __check_init__(self) -> None:
+        """Refuse impossible settings while the caller's line is on the stack."""
+        _check_range("lag", self.lag, 0, 1001)
+        _check_range("window_frames", self.window_frames, 4, 1001)
+        _check_range("most_unit_gaps", self.most_unit_gaps, 1.0)
+        for name in ("leave", "come_back", "start_off"):
+            _check_range(name, getattr(self, name), 1e-9, 1.0)
+        for name in ("evidence", "step_gaps", "reach_gaps", "place_gaps", "near_gaps"):
+            _check_range(name, getattr(self, name), 1e-9)
+        _check_range("drift", self.drift, 0.0)
+
+
 class AuditConfig(eqx.Module):
     """How the judge labels, splits and measures; nothing here reaches the robot side."""
 
@@ -113,6 +173,9 @@ class AuditConfig(eqx.Module):
     block_frames: int = 40
     """Length of a bootstrap block in frames: twice the window, so that windows stay whole."""
 
+    max_wrong: float = 0.05
+    """Share of the accepted answers that may be wrong, in (0, 1)."""
+
     def __check_init__(self) -> None:
         """Refuse impossible settings while the caller's line is on the stack."""
         _check_range("r_in_m", self.r_in_m, 1e-9)
@@ -125,12 +188,23 @@ class AuditConfig(eqx.Module):
         _check_range("confidence", self.confidence, 1e-6, 1.0)
         _check_range("n_bootstrap", self.n_bootstrap, 10, 100_001)
         _check_range("block_frames", self.block_frames, 1)
+        _check_range("max_wrong", self.max_wrong, 1e-6, 1.0)
+
+    @property
+    def wrong_m(self) -> float:
+        """Return how far from the truth an answer must lie to be wrong, metres.
+
+        Not below 2 r_in: a right answer may be off by the distance between the two sessions' tracks
+        and half a map spacing besides, which r_in stands for.
+        """
+        return max(self.r_out_m, 2.0 * self.r_in_m)
 
 
 class Config(eqx.Module):
     """One run, fully described."""
 
     stream: StreamConfig = StreamConfig()
+    verdict: VerdictConfig = VerdictConfig()
     audit: AuditConfig = AuditConfig()
     seed: int = eqx.field(static=True, default=0)
     """Seeds the simulated world and the bootstrap."""
@@ -138,6 +212,10 @@ class Config(eqx.Module):
     def __check_init__(self) -> None:
         """Refuse seeds that no generator takes."""
         _check_range("seed", self.seed, 0, 2**63)
+
+
+_PARTS = {"stream": StreamConfig, "verdict": VerdictConfig, "audit": AuditConfig}
+"""Tables of a settings file."""
 
 
 def replace(config: Config, changes: dict[str, Any]) -> Config:
@@ -151,7 +229,7 @@ def replace(config: Config, changes: dict[str, Any]) -> Config:
         ConfigError: a value is out of range or a name is unknown.
     """
     given = {name: value for name, value in changes.items() if value is not None}
-    parts = {"stream": config.stream, "audit": config.audit}
+    parts = {name: getattr(config, name) for name in _PARTS}
     for part, module in parts.items():
         mine = {f.name: given.pop(f.name) for f in dataclasses.fields(module) if f.name in given}
         parts[part] = dataclasses.replace(module, **mine)
@@ -196,9 +274,10 @@ def from_toml(path: Path) -> Config:
         if name == "seed":
             parts[name] = _typed(name, value, 0)
             continue
-        cls = {"stream": StreamConfig, "audit": AuditConfig}.get(name)
+        cls = _PARTS.get(name)
         if cls is None or not isinstance(value, dict):
-            raise ConfigError(f"{path}: unknown entry {name!r}; known: seed, [stream], [audit]")
+            known = ", ".join(f"[{part}]" for part in _PARTS)
+            raise ConfigError(f"{path}: unknown entry {name!r}; known: seed, {known}")
         defaults = {f.name: f.default for f in dataclasses.fields(cls)}
         unknown = sorted(set(value) - set(defaults))
         if unknown:
@@ -216,7 +295,7 @@ def from_toml(path: Path) -> Config:
 def to_toml(config: Config) -> str:
     """Return the settings as TOML that `from_toml` reads back unchanged."""
     lines = [f"seed = {config.seed}"]
-    for name in ("stream", "audit"):
+    for name in _PARTS:
         module = getattr(config, name)
         lines.append(f"\n[{name}]")
         for field in dataclasses.fields(module):

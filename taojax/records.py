@@ -18,12 +18,13 @@ from taojax.parts import locked_part
 from taojax.specs import fail, load_spec, open_file, read_bytes, read_npz, write_atomically
 from taojax.tables import read_table, table_text
 
-SCHEMA = 1
+SCHEMA = 2
+"""Of a run's manifest; 1 was taojax 0.1.0, whose runs have no delayed.csv."""
 
 INPUTS = "inputs/"
 """Before the names of sensor files in a manifest."""
 
-SEALED = ("config.toml", "map_poses.csv", "retrievals.npz", "signals.csv")
+SEALED = ("config.toml", "delayed.csv", "map_poses.csv", "retrievals.npz", "signals.csv")
 """Files whose bytes the manifest vouches for, beside the hashes of the inputs."""
 
 CARRIED = ("odometry.csv", "decisions.csv", "detector.toml", "tracks.npz")
@@ -51,6 +52,9 @@ class Run:
     signals: dict[str, np.ndarray]
     """Column -> (T,) as in data_specs/signals.toml; numbers float64, status str."""
 
+    delayed: dict[str, np.ndarray]
+    """Column -> (T,) as in data_specs/delayed.toml: what was known a lag later."""
+
     map_poses: dict[str, np.ndarray]
     """Column -> (M,) as in data_specs/map_poses.toml."""
 
@@ -70,7 +74,7 @@ class Run:
     """Rivals by name; None where they were not asked for."""
 
     decisions: dict[str, np.ndarray] | None = None
-    """Run-time verdicts, as in data_specs/decisions.toml; None where nobody decided."""
+    """Run-time verdicts, as in data_specs/verdicts.toml; None where nobody decided."""
 
 
 def signal_names() -> tuple[str, ...]:
@@ -181,6 +185,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     out: Path,
     *,
     signals: Mapping[str, np.ndarray],
+    delayed: Mapping[str, np.ndarray],
     map_poses: Mapping[str, np.ndarray],
     index: np.ndarray,
     similarity: np.ndarray,
@@ -188,7 +193,7 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     manifest: Mapping[str, Any],
     odometry: bytes | None = None,
     decisions: Mapping[str, np.ndarray] | None = None,
-    detector_toml: str | None = None,
+    calibration_toml: str | None = None,
     tracks: Mapping[str, SealedTrack] | None = None,
 ) -> dict[str, Any]:
     """Seal one run.
@@ -196,14 +201,15 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
     Args:
         out: folder to make; must be absent or empty.
         signals: column -> (T,); every column of data_specs/signals.toml.
+        delayed: the same of data_specs/delayed.toml.
         map_poses: column -> (M,).
         index: (T, 100) integers, -1 = no candidate.
         similarity: (T, 100).
         config_toml: resolved settings.
         manifest: facts about the run; `sha256` may already hold hashes of the inputs.
         odometry: bytes of query/odometry.csv, unchanged: a copy that rounds is another input.
-        decisions: columns of data_specs/decisions.toml where a calibration was carried along.
-        detector_toml: the calibration that decided.
+        decisions: columns of data_specs/verdicts.toml.
+        calibration_toml: the calibration that decided.
         tracks: rivals by name, where they were asked for.
 
     Returns:
@@ -219,13 +225,14 @@ def write_run(  # noqa: PLR0913 - one argument per sealed thing
             index=index.astype(np.int32), similarity=similarity.astype(np.float32)
         ),
         "signals.csv": table_text("signals", signals).encode(),
+        "delayed.csv": table_text("delayed", delayed).encode(),
     }
     if odometry is not None:
         files["odometry.csv"] = odometry
-    if detector_toml is not None:
-        files["detector.toml"] = detector_toml.encode()
+    if calibration_toml is not None:
+        files["detector.toml"] = calibration_toml.encode()
     if decisions is not None:
-        files["decisions.csv"] = table_text("decisions", decisions).encode()
+        files["decisions.csv"] = table_text("verdicts", decisions).encode()
     if tracks is not None:
         files["tracks.npz"] = archive(
             signal=np.stack([t.signal for t in tracks.values()]).astype(np.float32),
@@ -257,6 +264,8 @@ def read_manifest(run: Path) -> dict[str, Any]:
         raise fail(run, "holds several scenarios", f"name one of them, such as {run}/default")
     if not isinstance(manifest, dict) or not isinstance(manifest.get("sha256"), dict):
         raise InputError(f"{path}: is not the manifest of a run; {fix}")
+    if manifest.get("schema") == 1:
+        raise InputError(f"{path}: was sealed by taojax 0.1.0, which had no final verdicts; {fix}")
     if manifest.get("schema") != SCHEMA:
         raise InputError(f"{path}: schema {manifest.get('schema')!r} is not {SCHEMA}; {fix}")
     if manifest.get("seal") != seal_of(manifest):
@@ -290,11 +299,12 @@ def read_run(run: Path) -> Run:
         raise InputError(f"{run / 'retrievals.npz'}: names map rows that map_poses.csv has not")
     return Run(
         signals=read_table(run / "signals.csv", "signals"),
+        delayed=read_table(run / "delayed.csv", "delayed"),
         map_poses=map_poses,
         index=arrays["index"],
         similarity=arrays["similarity"],
         config_toml=(run / "config.toml").read_text(encoding="utf-8"),
         manifest=manifest,
-        decisions=decisions and read_table(decisions, "decisions"),
+        decisions=decisions and read_table(decisions, "verdicts"),
         tracks=tracks and _read_tracks(tracks, manifest["tracks"]),
     )

@@ -91,7 +91,7 @@ def read_run(run: str | Path, *, judged: str | Path | None = None) -> Results:
         map_poses=_table("map_poses", sealed.map_poses),
         decisions=None
         if sealed.decisions is None
-        else _table("decisions", sealed.decisions, "frame"),
+        else _table("verdicts", sealed.decisions, "frame"),
         labels=found.get("labels"),
         verdicts=found.get("verdicts"),
         metrics=found.get("metrics"),

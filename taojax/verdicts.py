@@ -1,10 +1,11 @@
-"""May this answer enter the graph? One verdict per frame, with its reason, for robot and judge."""
+"""May this answer enter the graph? Two verdicts per frame, with reasons, for robot and judge."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
-from taojax.detector import Detector, log_odds_terms, probability
+from taojax.detector import probability
+from taojax.risk import Calibration, Risk, probability_wrong, terms
 
 STATUS_MEANS = {
     "ok": "",
@@ -15,11 +16,13 @@ STATUS_MEANS = {
 }
 """Status -> what it says; no comma, because reasons stand in CSV cells."""
 
-STALE = "stale: this frame itself does not support the place"
-"""Why a frame that looks in-map is not accepted: its closure would rest on older frames alone, and
-after a kidnap those are wrong."""
+SILENT = ("warming_up", "no_candidates")
+"""Statuses of frames that offer no answer of their own to be accepted."""
 
-NO_LEVEL = "no threshold: no in-map frame in the calibration split"
+REJECTED_ABOVE = 0.5
+"""An answer that is more likely wrong than right is rejected."""
+
+POSE = ("x_m", "y_m", "theta_rad")
 
 
 def plain(value: float) -> str:
@@ -27,53 +30,76 @@ def plain(value: float) -> str:
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 
-def _margin(p: float, threshold: float, terms: Mapping[str, float]) -> str:
-    """Say how far a probability lies from the threshold, and what speaks most for off the map."""
-    name, is_above = max(terms, key=lambda name: terms[name]), p > threshold
-    kind = "most of it from" if is_above else "its largest doubt is"
-    loudest = f"{kind} {name}: {plain(terms[name])} log odds above in-map"
-    if terms[name] <= 0:
-        loudest = "no signal lies above its in-map mean"
-    side = "exceeds" if is_above else "is within"
-    return (
-        f"probability {plain(p)} {side} threshold {plain(threshold)} by {plain(abs(p - threshold))}"
-        f"; {loudest}"
-    )
-
-
-def decide(detector: Detector, signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Judge every frame by its probability at the detector's frozen threshold.
-
-    Accepted is what lies within the threshold and is supported by the frame itself; nothing is
-    decided where the status is not `ok`, or where there is no threshold.
+def judged(
+    risk: Risk, features: Mapping[str, np.ndarray], status: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return verdict, reason and probability of being wrong of every answer.
 
     Args:
-        detector: frozen numbers.
+        risk: frozen numbers.
+        features: the columns that they read.
+        status: of every frame, as in signals.csv.
+    """
+    p, parts = probability_wrong(risk, features), terms(risk, features)
+    verdicts, reasons = [], []
+    for t, said in enumerate(status):
+        name = risk.columns[int(np.argmax(parts[t]))]
+        doubt = f"largest doubt: {name}"
+        if said in SILENT:
+            verdict, reason = "abstain", f"{said}: {STATUS_MEANS[said]}"
+        elif p[t] <= risk.level:
+            verdict = "accept"
+            reason = f"wrong with probability {plain(p[t])}; accepted up to {plain(risk.level)}"
+        elif p[t] > REJECTED_ABOVE:
+            verdict = "reject"
+            reason = f"wrong with probability {plain(p[t])}: more likely wrong than right; {doubt}"
+        elif np.isnan(risk.level):
+            verdict, reason = "abstain", f"no level: {risk.promise}"
+        else:
+            verdict = "abstain"
+            reason = (
+                f"wrong with probability {plain(p[t])}: neither sure enough to accept "
+                f"(at most {plain(risk.level)}) nor to reject; {doubt}"
+            )
+        verdicts.append(verdict)
+        reasons.append(reason.replace(",", ";"))
+    return np.array(verdicts, dtype=object), np.array(reasons, dtype=object), p
+
+
+def decide(
+    calibration: Calibration, signals: Mapping[str, np.ndarray], delayed: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Judge every frame twice: as it came, and a lag later.
+
+    Args:
+        calibration: frozen numbers.
         signals: the columns of signals.csv, status included.
+        delayed: the columns of delayed.csv.
 
     Returns:
-        The columns of verdicts.csv; no reason holds a comma.
+        The columns of verdicts.csv; no reason holds a comma. A frame without candidates, and the
+        first two, are answered by neither.
     """
-    threshold, p = detector.threshold, probability(detector, signals)
-    terms = log_odds_terms(detector, signals)
-    verdicts, reasons = [], []
-    for t, status in enumerate(signals["status"]):
-        is_above = bool(p[t] > threshold)
-        if status != "ok":
-            verdict, reason = "abstain", f"{status}: {STATUS_MEANS[status]}"
-        elif np.isnan(threshold):
-            verdict, reason = "abstain", NO_LEVEL
-        elif not is_above and signals["stale"][t] > 0:
-            verdict, reason = "abstain", STALE
-        else:
-            verdict = "reject" if is_above else "accept"
-            own = dict(zip(detector.columns, terms[t].tolist(), strict=True))
-            reason = _margin(float(p[t]), threshold, own)
-        verdicts.append(verdict)
-        reasons.append(reason)
+    status = np.asarray(signals["status"])
+    has = ~np.isin(status, SILENT)
+    verdict, reason, p = judged(calibration.final, delayed, status)
+    now, why_now, p_now = judged(calibration.now, signals, status)
+    answered = lambda values: np.where(has, np.asarray(values, float), np.nan)
+    nobody = np.full(len(status), np.nan)
     return {
         "frame": signals["frame"],
-        "verdict": np.array(verdicts, dtype=object),
-        "probability_map_out": p,
-        "reason": np.array(reasons, dtype=object),
+        "verdict": verdict,
+        "reason": reason,
+        "probability_wrong": p,
+        **{name: answered(delayed[name]) for name in POSE},
+        "map_index": np.where(has, np.asarray(delayed["map_index"]), -1),
+        "verdict_now": now,
+        "reason_now": why_now,
+        "probability_wrong_now": p_now,
+        "x_now_m": answered(signals["now_x_m"]),
+        "y_now_m": answered(signals["now_y_m"]),
+        "theta_now_rad": answered(signals["now_theta_rad"]),
+        "probability_map_out": nobody
+        if calibration.map_out is None
+        else probability(calibration.map_out, signals),
     }

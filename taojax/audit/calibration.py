@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.audit.labels import CalibrationSplit
-from taojax.detector import LIST_RECALL, Detector, MapFacts, probability
+from taojax.detector import LIST_RECALL, Detector, probability
 
 BLURRED = {
     "top1_w5": 0.45,
@@ -83,7 +83,6 @@ def _note(n_in: int, n_out: int) -> str:
 def fit(
     calibration: CalibrationSplit,
     map_recall: float = LIST_RECALL,
-    fitted_on: MapFacts | None = None,
 ) -> Detector:
     """Fit the probability of being map-out: logistic, shrunk to a prior made from the map alone.
 
@@ -93,7 +92,6 @@ def fit(
     Args:
         calibration: frames that may be fitted on; grey ones give scale but no label.
         map_recall: how far the map tells its own places apart; sealed in the run's manifest.
-        fitted_on: the map, for the day the numbers are used on another one.
 
     Returns:
         The detector. Its threshold is the level that accepts 95 % of the in-map calibration
@@ -133,7 +131,6 @@ def fit(
         bias=float(best[-1] + np.sum((level - mean) / scale * best[:-1])),
         threshold=float("nan"),
         note=_note(int(counts[0]), int(counts[1])),
-        fitted_on=fitted_on,
     )
     inside = probability(detector, calibration.signals)[calibration.is_in]
     return detector._replace(threshold=accepting_level(inside))

@@ -4,16 +4,14 @@ import dataclasses
 import json
 from pathlib import Path
 
-import numpy as np
-
 from taojax.audit import figures, report, tables
 from taojax.audit.judgement import Evaluation, Judgement, judge
 from taojax.audit.paste import paste_files
 from taojax.audit.truth import Truth, read_truth
 from taojax.audit.words import find_words
 from taojax.config import Config
-from taojax.detector import to_toml
 from taojax.records import read_run
+from taojax.risk import to_toml
 from taojax.specs import write_atomically
 from taojax.tables import table_text
 
@@ -38,6 +36,10 @@ def _settings(judgement: Judgement, truth: Truth) -> str:
         "seed": judgement.config.seed,
         "audit": {f.name: getattr(audit, f.name) for f in dataclasses.fields(audit)},
         "probability": judgement.detector.note,
+        "promise": {
+            "now": judgement.calibration.now.promise,
+            "final": judgement.calibration.final.promise,
+        },
     }
     return json.dumps(facts, indent=2) + "\n"
 
@@ -78,8 +80,9 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
         "metrics.csv": table_text("metrics", judgement.metrics),
         "audit.json": _settings(judgement, known),
     }
-    if not np.isnan(judgement.detector.threshold):
-        files["calibration.toml"] = to_toml(judgement.detector)
+    files["calibration.toml"] = to_toml(judgement.calibration)
+    files |= tables.as_files("verdict_table", judgement.accepted, "verdicts")
+    files["tables/risk_coverage.csv"] = table_text("risk_coverage", judgement.risk_coverage)
     for name in ("metrics", "recall", "micro", "errors", "conformal"):
         files |= tables.as_files(name, getattr(judgement, name))
     for drawn in pictures:

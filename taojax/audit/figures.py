@@ -13,11 +13,14 @@ from taojax.audit import calibration
 from taojax.audit.judgement import Judgement
 from taojax.specs import load_spec
 
-TRACED = ("top1", "top1_w10", "velocity", "tao", "fused")
+TRACED = ("top1", "top1_w10", "velocity", "tao", "probability_wrong")
 """Signals that are drawn."""
 
+_VERDICT = {"probability_wrong": "probability_wrong"}
+"""Those of them that stand in verdicts.csv -> their column."""
 
-OURS = ("fused", "tao")
+
+OURS = ("probability_wrong", "tao")
 """Those drawn with thicker lines."""
 
 STRICT = ("top1", "velocity", "c_geom", "tao", "a_aniso")
@@ -74,7 +77,7 @@ def retrieval(judgement: Judgement) -> Picture:
 
 def _traces(judgement: Judgement) -> dict[str, np.ndarray]:
     return {
-        name: judgement.verdicts["probability_map_out"] if name == "fused"
+        name: judgement.verdicts[_VERDICT[name]] if name in _VERDICT
         else judgement.signals[name].astype(float)
         for name in TRACED
     }  # fmt: skip
@@ -86,6 +89,7 @@ def diagnostics(judgement: Judgement) -> Picture:
     unit = {c["name"]: c.get("unit", "1") for c in load_spec("signals")["columns"]}
     table = judgement.metrics
     threshold = dict(zip(table["signal"], table["threshold"], strict=True))
+    threshold["probability_wrong"] = judgement.calibration.final.level
     start = int((judgement.splits.name != "test").sum())
     figure = Figure(figsize=(8.6, 7.2), layout="constrained")
     axes = figure.subplots(len(traces), sharex=True)
@@ -113,8 +117,9 @@ def diagnostics(judgement: Judgement) -> Picture:
     caption = (
         "Shaded: truly off the map. Dashed: threshold, frozen on the calibration split. Dotted: "
         "start of the test split. Larger means more likely off the map; the highest half per "
-        "cent of values may leave the panel. A signal without a unit is dimensionless; fused is "
-        "the calibrated probability of being off the map."
+        "cent of values may leave the panel. A signal without a unit is dimensionless; "
+        "probability_wrong is that of the final answer, and its line is the level up to which "
+        "answers are accepted."
     )
     return picture(figure, "diagnostics", "Signals over time", caption, csv_text(columns | traces))
 
@@ -122,7 +127,7 @@ def diagnostics(judgement: Judgement) -> Picture:
 def verdict_map(judgement: Judgement) -> Picture:
     """Draw the test frames on the map, coloured by what the verdict led to."""
     test = judgement.splits.name == "test"
-    matched = np.stack([judgement.signals["x_m"], judgement.signals["y_m"]], axis=1).astype(float)
+    matched = np.stack([judgement.verdicts["x_m"], judgement.verdicts["y_m"]], axis=1)
     wrong = matched[test & (judgement.outcome == "accepted_wrong")]
     size = plots.map_size(judgement.map_m, judgement.query_m[test], wrong)
     figure = Figure(figsize=size, layout="constrained")

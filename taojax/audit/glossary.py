@@ -28,18 +28,21 @@ def about(column: str, spec: str = "metrics") -> str:
 def glossary() -> Mapping[str, str]:
     """Return word -> definition; numbers are defined where their spec defines them."""
     return {
-        "accepted": "verdict accept: the probability of being off the map is at or below the "
-        "frozen threshold, and the newest frame supports the place",
-        "rejected": "verdict reject: the probability of being off the map exceeds the frozen "
-        "threshold",
-        "abstained": "verdict abstain: there is no pose to judge (warming up, degenerate window, "
-        "no candidate, lost), or the newest frame does not support it",
+        "accepted": "final verdict accept: the probability of being wrong is at or below the "
+        "frozen level",
+        "rejected": "final verdict reject: the answer is more likely wrong than right",
+        "abstained": "final verdict abstain: neither sure enough to accept nor to reject, or "
+        "there is no answer (warming up, no candidate), or no level",
+        "wrong share": "of the accepted test answers, the share farther than max(r_out, 2 r_in) "
+        "from the truth",
+        "recall": "of the right test answers of frames within r_out of a map pose, the share "
+        "accepted",
+        "right": "an answer within max(r_out, 2 r_in) of the truth",
         "in-map": "a frame whose true position lies within r_in of a map pose",
         "map-out": "a frame whose true position lies farther than r_out from every map pose",
         "off the map": "map-out: the true position lies farther than r_out from every map pose",
         "grey": "frames between r_in and r_out: neither in-map nor map-out, so not scored",
-        "wrong place": "the frame is map-out, or the answered pose lies more than 2 r_in from the "
-        "truth",
+        "wrong place": "the answered pose lies more than max(r_out, 2 r_in) from the truth",
         "calibration split": "the first part of the recording; thresholds and the probability "
         "are fitted on it and then frozen",
         "test frames": "the last part of the recording, one window after the calibration split; "
@@ -74,6 +77,11 @@ def glossary() -> Mapping[str, str]:
     }
 
 
+WRONG = (
+    "calibrated probability that the {} answer is wrong, farther than max(r_out, 2 r_in) from the "
+    "truth"
+)
+
 FUSED = "calibrated probability of being off the map, from the sealed signals of the frame alone"
 
 
@@ -85,7 +93,11 @@ def names_of_signals() -> Mapping[str, str]:
         if column.get("signal"):
             unit = column.get("unit", "1")
             found[column["name"]] = column["about"] + (f" [{unit}]" if unit != "1" else "")
-    return found | {"fused": FUSED}
+    own = {
+        "probability_wrong_now": WRONG.format("causal"),
+        "probability_wrong": WRONG.format("final"),
+    }
+    return found | own | {"fused": FUSED}
 
 
 def names_of_tables(specs: Sequence[str]) -> dict[str, str]:

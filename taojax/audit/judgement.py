@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from taojax.audit import calibration, labels, metrics, tables
+from taojax.audit import calibration, labels, metrics, risk, tables
 from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
 from taojax.config import Config
 from taojax.detector import Detector
 from taojax.records import Run, map_of, signal_names
+from taojax.risk import Calibration, for_run, shipped
 from taojax.verdicts import decide
 
 
@@ -31,7 +32,10 @@ class Judgement(NamedTuple):
     """Distance to the nearest map pose, metres."""
 
     error_m: Float[np.ndarray, " t"]
-    """Distance from the answered pose to the truth, metres; NaN = no pose."""
+    """Distance from the final answer to the truth, metres; NaN = no answer."""
+
+    answers: risk.Answers
+    """Right or wrong, per frame."""
 
     label: Shaped[np.ndarray, " t"]
     splits: labels.Splits
@@ -57,22 +61,27 @@ class Judgement(NamedTuple):
     """What the conformal rule promises for tao."""
 
     detector: Detector
-    """The frozen numbers behind the probability."""
+    """The frozen numbers behind the probability of being off the map."""
+
+    calibration: Calibration
+    """All frozen numbers, those behind the verdicts among them."""
+
+    accepted: tables.Table
+    """Right and wrong among the accepted, now and finally; tables/verdicts.csv."""
+
+    risk_coverage: tables.Table
 
     clock_gap_s: float
     """Largest difference between the time stamps of run and truth."""
 
 
-def _outcomes(
-    verdict: np.ndarray, label: np.ndarray, error_m: np.ndarray, within_m: float
-) -> np.ndarray:
+def _outcomes(verdict: np.ndarray, label: np.ndarray, own: risk.Own) -> np.ndarray:
     """Say of each frame what the verdict led to."""
-    is_wrong = (label == "map_out") | (error_m > within_m)
-    accepted = np.where(is_wrong, "accepted_wrong", "accepted_in")
+    accepted = np.where(own.is_wrong, "accepted_wrong", "accepted_in")
     rejected = np.where(label == "map_out", "rejected_out", "rejected_in")
+    rejected = np.where(label == "grey", "grey", rejected)
     outcome = np.where(verdict == "accept", accepted, rejected)
-    outcome = np.where(verdict == "abstain", "abstained", outcome)
-    return np.where(label == "grey", "grey", outcome)
+    return np.where(verdict == "abstain", "abstained", outcome)
 
 
 def judge(run: Run, truth: Truth, config: Config) -> Judgement:
@@ -92,16 +101,36 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
     label = labels.label_frames(nearest, audit.r_in_m, audit.r_out_m)
     signals = {name: run.signals[name] for name in signal_names()}
 
+    error, error_now = (
+        np.hypot(table[x] - truth.xy_m[:, 0], table[y] - truth.xy_m[:, 1])
+        for table, x, y in ((run.delayed, "x_m", "y_m"), (run.signals, "now_x_m", "now_y_m"))
+    )
+    answers = risk.Answers(*(
+        risk.own_answers(own, nearest, audit.wrong_m, audit.r_out_m) for own in (error_now, error)
+    ))  # fmt: skip
     share, gap = audit.calibration_share, config.stream.window
-    first = labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
+    # One splitter makes both halves, of the features of the answers as of the signals.
+    base = for_run(shipped(), audit.max_wrong, config.verdict.lag)
+    features = {name: run.signals[name] for name in base.now.columns}
+    features |= {name: run.delayed[name] for name in base.final.columns}
+    first = labels.split_frames(
+        signals | features, label, calibration_share=share, gap_frames=gap
+    ).calibration
     recall = float(run.manifest.get("map_recall", calibration.LIST_RECALL))
-    model = calibration.fit(first.calibration, recall, map_of(run.manifest))
-    verdicts = decide(model, run.signals)
-    # Cut again with the probability beside the signals: only the splitter makes the two tables.
-    with_fused = signals | {tables.FUSED: verdicts["probability_map_out"]}
+    half = answers.at(first.frame)
+    refined = [
+        risk.refine(pooled, first, own, audit.max_wrong)
+        for pooled, own in ((base.now, half.now), (base.final, half.final))
+    ]
+    model = calibration.fit(first, recall)
+    numbers = Calibration(refined[0], refined[1], model, map_of(run.manifest))
+    verdicts = decide(numbers, run.signals, run.delayed)
+    # Cut again with the probabilities beside the signals: only the splitter makes the two tables.
+    measured = signals | {name: verdicts[name] for name in (risk.NOW, risk.FINAL)}
+    with_fused = measured | {tables.FUSED: verdicts["probability_map_out"]}
     splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)
+    tested, both = answers.at(splits.test.frame), {"now": refined[0], "final": refined[1]}
 
-    error = np.hypot(run.signals["x_m"] - truth.xy_m[:, 0], run.signals["y_m"] - truth.xy_m[:, 1])
     inside, test = label == "in_map", splits.name == "test"
     accepted = verdicts["verdict"] == "accept"
     groups = {
@@ -121,18 +150,24 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         error_m=error,
         label=label,
         splits=splits,
-        outcome=_outcomes(verdicts["verdict"], label, error, 2 * audit.r_in_m),
+        outcome=_outcomes(verdicts["verdict"], label, answers.final),
+        answers=answers,
         decided=None
         if run.decisions is None
-        else _outcomes(run.decisions["verdict"], label, error, 2 * audit.r_in_m),
+        else _outcomes(run.decisions["verdict"], label, answers.final),
         recall_curves=curves,
         verdicts=verdicts,
-        metrics=tables.metrics_table(signals, label, splits, audit, config.seed),
+        metrics=tables.metrics_table(measured, label, splits, tested, audit, config.seed),
+        calibration=numbers,
+        accepted=tables.verdict_table(
+            verdicts, tested, splits.test.frame, both, audit, config.seed
+        ),
+        risk_coverage=tables.risk_coverage_table(splits.test.signals, tested, tuple(with_fused)),
         recall=tables.recall_table(curves, nearest),
         micro=tables.micro_table(signals, nearest, audit, config.seed),
         conformal=tables.conformal_table(tuple(signals), splits, audit),
         promise=tables.promised(splits.calibration, "tao", audit),
-        errors=tables.errors_table(error, groups, 2 * audit.r_in_m),
+        errors=tables.errors_table(error, groups, audit.wrong_m),
         detector=model,
         clock_gap_s=float(np.max(np.abs(truth.t_s - run.signals["t_s"]))),
     )

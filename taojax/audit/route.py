@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.audit.glossary import FUSED as FUSED_MEANS
+from taojax.audit.glossary import names_of_signals
 from taojax.audit.judgement import Judgement
+from taojax.audit.risk import FINAL, NOW
 from taojax.audit.tables import FUSED
 from taojax.plots import OUTCOMES
 from taojax.specs import load_spec
@@ -73,9 +74,9 @@ def _model(judgement: Judgement, names: list[str]) -> dict[str, Any]:
 def _signals(judgement: Judgement) -> list[dict[str, Any]]:
     """Return name, unit, meaning and frozen threshold of every signal."""
     specs = {c["name"]: c for c in load_spec("signals")["columns"] if c.get("signal")}
-    table, found = judgement.metrics, []
+    table, titles, found = judgement.metrics, names_of_signals(), []
     for name, threshold in zip(table["signal"], table["threshold"], strict=True):
-        spec = specs.get(str(name), {"about": FUSED_MEANS})
+        spec = specs.get(str(name), {"about": titles[str(name)]})
         found.append(
             {
                 "name": str(name),
@@ -105,8 +106,10 @@ def route_json(
     every = -(-len(judgement.label) // MOST_FRAMES)
     shown = slice(None, None, every)
     origin = np.floor(judgement.map_m.min(axis=0))
-    columns = judgement.signals | {FUSED: judgement.verdicts["probability_map_out"]}
-    pose = np.stack([judgement.signals["x_m"], judgement.signals["y_m"]], axis=1).astype(float)
+    verdicts = judgement.verdicts
+    columns = judgement.signals | {name: verdicts[name] for name in (NOW, FINAL)}
+    columns[FUSED] = verdicts["probability_map_out"]
+    pose = np.stack([verdicts["x_m"], verdicts["y_m"]], axis=1).astype(float)
     status, status_at = np.unique(judgement.signals["status"].astype(str), return_inverse=True)
     reason, reason_at = np.unique(
         judgement.verdicts["reason"][shown].astype(str), return_inverse=True

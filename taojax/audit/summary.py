@@ -127,7 +127,7 @@ def maps(scenarios: Mapping[str, Evaluation]) -> Picture:
         judgement = done.judgement
         test = judgement.splits.test.frame
         columns = ("x_m", "y_m")
-        matched = np.stack([judgement.signals[c][test] for c in columns], axis=1).astype(float)
+        matched = np.stack([judgement.verdicts[c][test] for c in columns], axis=1).astype(float)
         plots.verdict_map(
             judgement.map_m, judgement.query_m[test], matched, judgement.outcome[test], ax=ax
         )

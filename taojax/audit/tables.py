@@ -4,12 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
-from taojax.audit import bootstrap, calibration, metrics
+from taojax.audit import bootstrap, calibration, metrics, risk
 from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.config import AuditConfig
+from taojax.risk import Risk
 from taojax.specs import load_spec
 from taojax.tables import format_number, table_text
 from taojax.verdicts import plain
@@ -120,6 +121,7 @@ def metrics_table(
     signals: Mapping[str, np.ndarray],
     label: Shaped[np.ndarray, " t"],
     splits: Splits,
+    answers: risk.Answers,
     config: AuditConfig,
     seed: int,
 ) -> Table:
@@ -129,6 +131,7 @@ def metrics_table(
         signals: signal -> (t,) over the whole run, in the order of the rows.
         label: per frame.
         splits: of the same signals and of `fused`.
+        answers: right or wrong, of the test frames.
         config: thresholds and resamples.
         seed: of the bootstrap.
     """
@@ -157,6 +160,7 @@ def metrics_table(
             splits.calibration, name, config.sigmas, is_probability=name == FUSED
         )
         row |= operating_row(test, name, threshold, held)
+        row |= risk.risk_row(test.signals[name], answers.of(name))
         rows.append(row | (probability_row(test, held) if name == FUSED else {}))
     return from_rows("metrics", rows)
 
@@ -197,6 +201,66 @@ def conformal_table(names: Sequence[str], splits: Splits, config: AuditConfig) -
             }
         )
     return from_rows("conformal", rows)
+
+
+def verdict_table(
+    verdicts: Mapping[str, np.ndarray],
+    answers: risk.Answers,
+    frames: Int[np.ndarray, " n"],
+    risks: Mapping[str, Risk],
+    config: AuditConfig,
+    seed: int,
+) -> Table:
+    """Count right and wrong among the accepted test answers, and the accepted among the right.
+
+    Args:
+        verdicts: columns of verdicts.csv, all frames.
+        answers: right or wrong, of the test frames.
+        frames: the test frames.
+        risks: verdict -> the numbers it rests on.
+        config: block length and resamples.
+        seed: of the bootstrap.
+    """
+    weights = bootstrap.block_weights(len(frames), config.block_frames, config.n_bootstrap, seed)
+    rows = []
+    for name, column in (("now", "verdict_now"), ("final", "verdict")):
+        own = answers.now if name == "now" else answers.final
+        accepted = np.asarray(verdicts[column])[frames] == "accept"
+        right, wrong = accepted & own.is_right, accepted & own.is_wrong
+        counted, known = right | wrong, own.is_right
+        row: dict[str, Any] = {
+            "verdict": name, "accepted": counted.sum(), "right": right.sum(), "wrong": wrong.sum(),
+            "right_total": known.sum(), "max_wrong": risks[name].max_wrong,
+            "promise": risks[name].promise,
+        }  # fmt: skip
+        for share, of, among in (("wrong", wrong, counted), ("recall", right, known)):
+            if among.any():
+                drawn = bootstrap.weighted_mean(of[among].astype(float), weights[:, among])
+                value = "wrong_share" if share == "wrong" else "recall"
+                row[value] = of[among].mean()
+                row[f"{share}_lo"], row[f"{share}_hi"] = bootstrap.interval(drawn)
+        rows.append(row)
+    return from_rows("verdict_table", rows)
+
+
+def risk_coverage_table(
+    signals: Mapping[str, np.ndarray], answers: risk.Answers, names: Sequence[str]
+) -> Table:
+    """Return the risk-coverage curve of every signal over the test answers, in steps of 1 %.
+
+    Args:
+        signals: signal -> (n,) of the test frames.
+        answers: right or wrong, of the same.
+        names: which.
+    """
+    rows = []
+    for name in names:
+        coverage, share = risk.risk_coverage(signals[name], answers.of(name))
+        rows += [
+            {"signal": name, "coverage": c, "wrong_share": w}
+            for c, w in zip(coverage, share, strict=True)
+        ]
+    return from_rows("risk_coverage", rows)
 
 
 def micro_table(
@@ -290,10 +354,13 @@ def to_latex(name: str, table: Mapping[str, np.ndarray]) -> str:
     )
 
 
-def as_files(name: str, table: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Return a table of a spec as CSV, Markdown and LaTeX under `tables/`."""
+def as_files(
+    name: str, table: Mapping[str, np.ndarray], called: str | None = None
+) -> dict[str, str]:
+    """Return a table of a spec as CSV, Markdown and LaTeX under `tables/`, perhaps renamed."""
+    called = called or name
     return {
-        f"tables/{name}.csv": table_text(name, table),
-        f"tables/{name}.md": to_markdown(name, table),
-        f"tables/{name}.tex": to_latex(name, table),
+        f"tables/{called}.csv": table_text(name, table),
+        f"tables/{called}.md": to_markdown(name, table),
+        f"tables/{called}.tex": to_latex(name, table),
     }

@@ -20,7 +20,10 @@ from taojax.verdicts import plain
 
 _JOIN_FRAMES = 5  # wrong acceptances this close together are told as one stretch
 _MOST_STRETCHES = 3
-MAIN = ("top1", "top1_w10", "velocity", "tao_rank", "tao", "fused")
+MAIN = (
+    "top1", "top1_w10", "velocity", "tao_rank", "tao", "probability_wrong_now", "probability_wrong",
+    "fused",
+)  # fmt: skip
 """Signals that are told first; the others stand in the files."""
 
 _MOST = 0.5  # beyond this share a rate is called "most"
@@ -69,21 +72,48 @@ def rate(row: Mapping[str, Any], name: str) -> str:
     return f"{row[name]:.3f} ({span(row, name)})"
 
 
+def accepted_row(judgement: Judgement, verdict: str) -> dict[str, Any]:
+    """Return one row of tables/verdicts.csv: now or final."""
+    table = judgement.accepted
+    at = list(table["verdict"]).index(verdict)
+    return {name: values[at] for name, values in table.items()}
+
+
+def _trust(judgement: Judgement) -> list[str]:
+    """Say first what a user wants to know: of the accepted, of the right, and what is promised."""
+    if not len(judgement.splits.test.frame):
+        return [TOO_SHORT]
+    row, now = (accepted_row(judgement, name) for name in ("final", "now"))
+    n, right, total = (int(row[name]) for name in ("accepted", "right", "right_total"))
+    promise = f"Promised: {row['promise']}."
+    if not n:
+        return [
+            f"Of the test answers none is accepted, of {total} right ones; no closure of this "
+            f"recording should enter a graph. {promise}"
+        ]
+    shares = {"wrong_share": row["wrong_share"], "recall": row["recall"]}
+    shares |= {f"wrong_share_{end}": row[f"wrong_{end}"] for end in ("lo", "hi")}
+    shares |= {f"recall_{end}": row[f"recall_{end}"] for end in ("lo", "hi")}
+    return [
+        f"Of {n} accepted test answers {right} are right: wrong share "
+        f"{rate(shares, 'wrong_share')}. Of {total} right test answers {right} are accepted: "
+        f"recall {rate(shares, 'recall')}. {promise}",
+        f"Without waiting, {int(now['accepted'])} test answers are accepted at once, "
+        f"{int(now['right'])} of them right.",
+    ]
+
+
 def _counts(judgement: Judgement) -> list[str]:
     test, verdict = judgement.splits.test, judgement.verdicts["verdict"]
     n = len(test.frame)
     if n == 0:
-        return [TOO_SHORT]
+        return []
     count = {v: int((verdict[test.frame] == v).sum()) for v in ("accept", "reject", "abstain")}
-    outcome = judgement.outcome[test.frame]
-    right, wrong = (int((outcome == f"accepted_{kind}").sum()) for kind in ("in", "wrong"))
-    share = f" ({100 * wrong / (right + wrong):.0f} % of them wrong)" if right + wrong else ""
-    n_grey = count["accept"] - right - wrong
-    tail = f"; {n_grey} of the accepted lie in the grey zone, where none is right or wrong"
+    off = int((np.asarray(judgement.label)[test.frame] == "map_out").sum())
     return [
-        f"Of the {n} test frames ({test.frame[0]} to {test.frame[-1]}) taojax accepted "
-        f"{count['accept']}, {right} at the right place and {wrong} at a wrong place{share}, "
-        f"rejected {count['reject']} and abstained on {count['abstain']}{tail if n_grey else ''}."
+        f"Of the {n} test frames ({test.frame[0]} to {test.frame[-1]}), {off} of them off the map, "
+        f"taojax accepted {count['accept']}, rejected {count['reject']} and abstained on "
+        f"{count['abstain']}."
     ]
 
 
@@ -195,9 +225,8 @@ def _failures(judgement: Judgement) -> list[str]:
     )
     return [
         f"{len(wrong)} test {'frames were' if len(wrong) > 1 else 'frame was'} accepted at a wrong "
-        f"place ({n_off} off the map, "
-        f"{len(wrong) - n_off} in the map but more than {2 * judgement.config.audit.r_in_m:g} m "
-        f"off): {'; '.join(told)}{tail}."
+        f"place, more than {judgement.config.audit.wrong_m:g} m off ({n_off} off the map, "
+        f"{len(wrong) - n_off} elsewhere on it): {'; '.join(told)}{tail}."
     ]
 
 
@@ -206,7 +235,7 @@ def _errors(judgement: Judgement) -> list[str]:
     n = int(table["n"][0])
     if n == 0:
         return []
-    within = 2 * judgement.config.audit.r_in_m
+    within = judgement.config.audit.wrong_m
     return [
         f"Where {n} in-map test frames were accepted, the pose is off by "
         f"{table['median_m'][0]:.2f} m in the median and {table['p95_m'][0]:.2f} m at the 95th "
@@ -252,7 +281,7 @@ def _decided(judgement: Judgement) -> list[str]:
     accepted = np.isin(decided, ("accepted_in", "accepted_wrong"))
     rejected = np.isin(decided, ("rejected_in", "rejected_out"))
     return [
-        f"Decided at run time, with numbers frozen elsewhere (decisions.csv): of all "
+        f"Decided at run time, with numbers frozen before (decisions.csv): of all "
         f"{len(decided) - many('grey')} labelled frames {many('accepted_in')} were accepted at "
         f"the right place and {many('accepted_wrong')} at a wrong place; "
         f"{int((accepted & is_out).sum())} of {int(is_out.sum())} map-out frames were accepted, "
@@ -262,14 +291,14 @@ def _decided(judgement: Judgement) -> list[str]:
     ]
 
 
-_LEAD = (_decided, _use, _counts, _false_acceptance, _failures)
+_LEAD = (_trust, _decided, _use, _counts, _false_acceptance, _failures)
 
 
 def warnings(judgement: Judgement) -> tuple[str, ...]:
     """Return those of the sentences that should alarm the reader."""
     found = {TOO_SHORT, BLIND, *_use(judgement), *_clock(judgement)}
     if _is_mostly_wrong(judgement.outcome[judgement.splits.test.frame]):
-        found.update(_counts(judgement))
+        found.update(_trust(judgement))
     return tuple(sentence for sentence in find_words(judgement) if sentence in found)
 
 

@@ -122,8 +122,9 @@ def sealed_tables(folder: Path, run: Run, config: StreamConfig) -> MapTables:
         raise InputError(f"{folder}: {what}; score the data set again with `taojax score`")
     poses = stacked(run.map_poses, POSE)
     tables = map_tables(poses, config)
-    scale, recall = (jnp.asarray(facts[name], jnp.float32) for name in ("map_scale", "map_recall"))
-    return eqx.tree_at(lambda t: (t.scale, t.recall), tables, (scale, recall))
+    names = ("map_scale", "map_recall", "evidence_unit_m")
+    known = tuple(jnp.asarray(facts[name], jnp.float32) for name in names)
+    return eqx.tree_at(lambda t: (t.scale, t.recall, t.places.unit_m), tables, known)
 
 
 def _distinct(inside: Inside, apart_m: float, most: float, sources: list[str]) -> Branches:

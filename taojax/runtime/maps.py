@@ -8,8 +8,9 @@ from scipy.spatial import KDTree
 
 from taojax.config import StreamConfig
 from taojax.core.anchors import AnchorGrid
+from taojax.core.belief import Places
 from taojax.detector import LIST_RECALL
-from taojax.runtime.scale import LIST_SCALE, MapView, view_map
+from taojax.runtime.scale import LIST_SCALE, MapView, correlation_gaps, view_map
 
 NEIGHBOURS = 12
 """Anchors pooled around each anchor."""
@@ -19,6 +20,9 @@ REACH_DELTAS = 3.0
 
 ON_EDGES = 0.1
 """Share of anchors that one corner must serve better than the other to be preferred."""
+
+MOST_UNIT = 4.0
+"""A whole piece of evidence takes at most so many gaps of way, however slowly the map changes."""
 
 MAX_CELLS = 1500
 """Cells along the longer side at most; a larger map gets coarser cells, not more memory."""
@@ -43,6 +47,9 @@ class MapTables(eqx.Module):
     recall: Float[Array, ""]
     """How far the map tells its own places apart, 0 to 1."""
 
+    places: Places
+    """The same anchors for the filter: its unit of length needs no driving order."""
+
 
 def map_spacing_m(xy: np.ndarray) -> float:
     """Return the median step between consecutive map positions while the robot was moving.
@@ -61,10 +68,26 @@ def map_spacing_m(xy: np.ndarray) -> float:
     return float(np.median(steps[steps >= 0.25 * np.quantile(steps, 0.9)]))
 
 
-def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
+def gap_m(xy: np.ndarray) -> float:
+    """Return the median distance from a map position to the nearest other one.
+
+    Args:
+        xy: `(M, 2)` metres, any order.
+
+    Returns:
+        Metres; distances below a quarter of the 90 % quantile are standstill or a second pass and
+        do not count. 1 where all positions are one.
+    """
+    nearest = KDTree(xy).query(xy, k=min(2, len(xy)))[0].reshape(len(xy), -1)[:, -1]
+    nearest = nearest[nearest > 1e-6]
+    if not nearest.size:
+        return 1.0
+    return float(np.median(nearest[nearest >= 0.25 * np.quantile(nearest, 0.9)]))
+
+
+def _grid(poses: np.ndarray, spacing_m: float, delta_m: float, reach: float) -> AnchorGrid:
     xy = poses[:, :2]
     tree = KDTree(xy)
-    reach = REACH_DELTAS * delta_m
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     cell_m = max(spacing_m, float((high - low).max()) / MAX_CELLS)
     low = _corner(tree, low, cell_m)
@@ -122,8 +145,17 @@ def map_tables(
     if descriptors is not None:
         view = view_map(descriptors, poses[:, :2], spacing_m)
     centred = poses[:, :2] - poses[:, :2].mean(axis=0)
+    delta_m, step_m = float(config.delta_spacings) * spacing_m, gap_m(poses[:, :2])
+    unit = 1.0
+    if descriptors is not None:
+        unit = float(np.clip(correlation_gaps(descriptors, poses[:, :2], step_m), 1.0, MOST_UNIT))
     return MapTables(
-        grid=_grid(poses, spacing_m, float(config.delta_spacings) * spacing_m),
+        grid=_grid(poses, spacing_m, delta_m, REACH_DELTAS * delta_m),
+        places=Places(
+            grid=_grid(poses, 0.5 * step_m, delta_m, 4.0 * step_m),
+            gap_m=jnp.asarray(step_m, jnp.float32),
+            unit_m=jnp.asarray(unit * step_m, jnp.float32),
+        ),
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
         extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
         scale=jnp.asarray(view.scale, jnp.float32),

@@ -57,6 +57,7 @@ def view_map(descriptors: np.ndarray, xy: np.ndarray, spacing_m: float) -> MapVi
         spacing_m: median distance between neighbouring images.
     """
     chosen = np.unique(np.linspace(0, len(descriptors) - 1, SAMPLE).astype(int))
+    chosen = np.sort(_spread_rows(xy)[chosen])
     sample = jnp.asarray(normalise(descriptors[chosen]))
     parts = []
     for start in range(0, len(descriptors), 8192):
@@ -86,3 +87,47 @@ def rescale(scale: Float[Array, "2"], similarity: Float[Array, " c"]) -> Float[A
     """
     scaled = (similarity - scale[0]) / jnp.maximum(scale[1] - scale[0], LEAST_RANGE)
     return jnp.clip(scaled, 0.0, 1.0)
+
+
+def correlation_gaps(descriptors: np.ndarray, xy: np.ndarray, gap_m: float) -> float:
+    """Return how far the robot drives until an image looks new, as the map alone shows it.
+
+    Args:
+        descriptors: `(M, D)` of the map images, any scale.
+        xy: `(M, 2)` their positions [m].
+        gap_m: median distance between neighbouring images.
+
+    Returns:
+        The distance, in gaps, at which the mean similarity has lost half of what neighbours have
+        above the background of the whole map; 64 where it never does.
+    """
+    chosen = np.unique(np.linspace(0, len(descriptors) - 1, SAMPLE).astype(int))
+    chosen = _spread_rows(xy)[chosen]
+    sample = jnp.asarray(normalise(descriptors[chosen]))
+    low, total, count = 0.5, np.zeros(len(_EDGES) - 1), np.zeros(len(_EDGES) - 1)
+    every, n_every = 0.0, 0
+    for start in range(0, len(descriptors), 8192):
+        block = normalise(descriptors[start : start + 8192])
+        rows = np.asarray(similarities(jnp.asarray(block), sample))
+        gap = np.asarray(xy)[chosen][:, None] - np.asarray(xy)[start : start + len(block)][None]
+        away = np.hypot(gap[..., 0], gap[..., 1]) / gap_m
+        bins = np.digitize(away, _EDGES) - 1
+        is_in = (away >= low) & (bins >= 0) & (bins < len(total))
+        total += np.bincount(bins[is_in], weights=rows[is_in], minlength=len(total))
+        count += np.bincount(bins[is_in], minlength=len(total))
+        every, n_every = every + float(rows.sum()), n_every + rows.size
+    mean = total / np.maximum(count, 1)
+    background, known = every / max(n_every, 1), count > 0
+    if not known[0] or mean[0] <= background:
+        return 1.0
+    low_at = np.flatnonzero(known & (mean - background < 0.5 * (mean[0] - background)))
+    return float(_EDGES[low_at[0]]) if low_at.size else float(_EDGES[-1])
+
+
+_EDGES = np.array([0.5, 1.5, 2.5, 3.5, 4.5, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 64.0])
+
+
+def _spread_rows(xy: np.ndarray) -> np.ndarray:
+    """Return the rows by distance from the centre: the same images whatever the rows' order."""
+    centred = np.asarray(xy) - np.mean(xy, axis=0)
+    return np.argsort(np.hypot(centred[:, 0], centred[:, 1]), kind="stable")

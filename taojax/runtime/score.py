@@ -12,10 +12,12 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, replace, to_toml
-from taojax.detector import Detector, foreign_map
-from taojax.detector import to_toml as detector_toml
+from taojax.detector import foreign_map
 from taojax.errors import InputError
 from taojax.records import code_digest, map_of, refuse_if_taken, write_run
+from taojax.risk import SHIPPED, Calibration, for_run, shipped
+from taojax.risk import to_toml as calibration_toml
+from taojax.runtime import hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
@@ -118,6 +120,8 @@ def map_facts(tables: MapTables) -> dict[str, Any]:
         "map_spacing_m": float(tables.spacing_m),
         "map_scale": [float(end) for end in tables.scale],
         "map_recall": float(tables.recall),
+        "map_gap_m": float(tables.places.gap_m),
+        "evidence_unit_m": float(tables.places.unit_m),
     }
 
 
@@ -126,7 +130,7 @@ def score(
     out: Path,
     config: Config,
     *,
-    detector: Detector | None = None,
+    calibration: Calibration | None = None,
     rival_logs: int | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
@@ -139,7 +143,7 @@ def score(
         dataset: a data folder, laid out as data_specs/README.md says.
         out: run folder to make; must be absent or empty.
         config: settings.
-        detector: frozen numbers of an earlier audit; adds decisions.csv.
+        calibration: frozen numbers of an earlier audit; the shipped ones when omitted.
         rival_logs: also run the rank association and, on so many first trials (a folder without
             trials is one), every rival; adds tracks.npz. None = neither.
         progress: draw a bar on stderr.
@@ -164,6 +168,8 @@ def score(
         return replay_trials(config, tables, in_trials(frames, n), progress=progress)
 
     records = replayed(config)
+    seen = hindsight.clean(tables, np.asarray(observations.odometry), index, similarity)
+    both = hindsight.replay_each(config.verdict, tables, seen, n, progress=progress)
     tracks = None
     if rival_logs is not None:
         literal = replayed(replace(config, {"association": "rank"}))
@@ -171,17 +177,22 @@ def score(
         tracks = {"tao_rank": sealed_track(literal, "tao_rank"), **said}
     # What repeats this run, seen from its own folder; the words typed may name files long gone.
     command = f"taojax score {dataset} --config config.toml"
-    table = signal_table(observations.t_s, records)
+    table = signal_table(observations.t_s, records) | hindsight.now_columns(both.now)
+    delayed = hindsight.delayed_columns(tables, both)
     notes = list(observations.notes)
     known_map = {**map_facts(tables), "sha256": observations.sha256}
-    if detector is not None and (said := foreign_map(detector, map_of(known_map))):
+    used = for_run(calibration or shipped(), config.audit.max_wrong, config.verdict.lag)
+    if said := foreign_map(used.fitted_on, map_of(known_map)):
         notes.append(said)
+    if calibration is None:
+        notes.append(f"decided with {SHIPPED}: no frame of this place has set its level")
     return write_run(
         out,
         signals=table,
+        delayed=delayed,
         odometry=read_bytes(dataset / "query/odometry.csv"),
-        decisions=None if detector is None else decide(detector, table),
-        detector_toml=None if detector is None else detector_toml(detector),
+        decisions=decide(used, table, delayed),
+        calibration_toml=calibration_toml(used),
         tracks=tracks,
         map_poses=observations.map_poses,
         index=index,

@@ -8,7 +8,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from functools import partial
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -19,10 +18,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.about import DESCRIPTORS
-from taojax.config import StreamConfig
-from taojax.detector import Detector, MapFacts
+from taojax.config import Config, StreamConfig
+from taojax.detector import MapFacts
 from taojax.errors import InputError
 from taojax.records import digest_file
+from taojax.risk import Calibration, shipped
+from taojax.runtime import hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import descriptor_names
@@ -30,7 +31,7 @@ from taojax.runtime.retrieval import N_KEPT
 from taojax.runtime.stream import init, step
 from taojax.specs import read_npy
 from taojax.tables import POSE, read_table, stacked
-from taojax.verdicts import STATUS_MEANS, decide
+from taojax.verdicts import SILENT, judged
 
 MOST_BYTES = 1 << 20
 """Longest line; what is longer is skipped up to its end, never held."""
@@ -41,6 +42,11 @@ LIMIT = {"odometry": (1e5, 1e5, 1e4), "similarity": 1.0 + 1e-3, "rise": 1e-6}
 REMEMBERED = 100_000
 """Latencies behind the summary: the last so many frames."""
 
+
+LONGEST_COMPILED = 6
+"""So many lags of blank frames, which stand still, are waited for until a block is final."""
+
+COVARIANCE = ("var_x_m2", "var_y_m2", "cov_xy_m2")
 
 BLANK = b'{"odometry": [0, 0, 0], "index": [], "similarity": []}'
 """An observation of nothing, to compile with."""
@@ -194,29 +200,39 @@ class Watch:
     """
 
     def __init__(
-        self, config: StreamConfig, tables: MapTables, detector: Detector | None = None
+        self, config: Config, tables: MapTables, calibration: Calibration | None = None
     ) -> None:
         """Compile the step.
 
         Args:
-            config: settings.
+            config: settings; those of the judge are not used.
             tables: from `load_map`.
-            detector: frozen numbers; None = nothing is decided.
+            calibration: frozen numbers; the shipped ones when omitted.
         """
         # The map stays an argument: folded into the program it compiles for longer, and rounds
         # differently from `taojax score`.
-        self._advance = partial(step, config, tables)
-        self._detector = detector
+        self._config, self._tables = config, tables
+        self._calibration = calibration or shipped()
         self._n_map = tables.grid.xy.shape[0]
-        self._n_frames, self._state = 0, init(config, tables)
         self.latencies_ms: deque[float] = deque(maxlen=REMEMBERED)
-        for _ in range(2):
+        self._start()
+        # As many frames as a first block needs, so that its program is compiled too.
+        for _ in range(LONGEST_COMPILED * (config.verdict.lag + 1)):
             self.answer(BLANK)
-        self._state, self._n_frames = init(config, tables), 0
+            if self._n_final:
+                break
+        self._start()
         self.latencies_ms.clear()
 
-    def answer(self, line: bytes) -> dict[str, Any]:
-        """Take in one line and say what it means; a line that is no observation changes nothing.
+    def _start(self) -> None:
+        self._state, self._n_frames, self._n_final = init(self._config.stream, self._tables), 0, 0
+        self._follower = hindsight.Follower(self._config.verdict, self._tables)
+        self._waiting: deque[tuple[float | None, str, str, dict[str, float]]] = deque()
+
+    def answer(self, line: bytes) -> list[dict[str, Any]]:
+        """Take in one line; say what it means, and what is final now of earlier ones.
+
+        A line that is no observation changes nothing.
 
         Raises:
             LineError: saying what is wrong with the line.
@@ -224,34 +240,75 @@ class Watch:
         start = time.perf_counter()
         seen = parse(line, self._n_map)
         frame = Frame(*(jnp.asarray(leaf) for leaf in seen[1:]))
-        self._state, record = self._advance(self._state, frame)
-        said = self._said(seen.t_s, jax.device_get(record))
+        self._state, record = step(self._config.stream, self._tables, self._state, frame)
+        clean = hindsight.clean(
+            self._tables, seen.odometry[None], seen.rows[None], seen.similarity[None]
+        )
+        now, finished = self._follower.push(jax.tree.map(lambda leaf: leaf[0], clean))
+        said = self._said(seen.t_s, jax.device_get(record), now)
         self._n_frames += 1
+        lines = [said, *self._finals(finished)]
         said["latency_ms"] = round(1e3 * (time.perf_counter() - start), 3)
         self.latencies_ms.append(said["latency_ms"])
-        return said
+        return lines
 
-    def _said(self, t_s: float | None, record: StreamRecord) -> dict[str, Any]:
+    def flush(self) -> list[dict[str, Any]]:
+        """Say what is final of the last frames, of which nothing more will be known."""
+        return self._finals(self._follower.flush())
+
+    def _said(
+        self, t_s: float | None, record: StreamRecord, now: hindsight.Answer
+    ) -> dict[str, Any]:
         status = STATUSES[int(record.status)]
         row = {name: float(value) for name, value in record.signals.items()}
-        verdict, p, why = None, None, STATUS_MEANS[status]
-        if self._detector is not None:
-            table = {name: np.array([value]) for name, value in row.items()}
-            table |= {"frame": np.array([0]), "status": np.array([status], dtype=object)}
-            decided = decide(self._detector, table)
-            verdict, p = str(decided["verdict"][0]), float(decided["probability_map_out"][0])
-            why = str(decided["reason"][0])
+        one = jax.tree.map(lambda leaf: leaf[None], now)
+        columns = hindsight.now_columns(one)
+        verdict, why, p = judged(
+            self._calibration.now,
+            columns | {name: np.array([value]) for name, value in row.items()},
+            np.array([status], dtype=object),
+        )
+        self._waiting.append((t_s, status, str(verdict[0]), row))
         return {
+            "kind": "now",
             "frame": self._n_frames,
             "t_s": t_s,
             "status": status,
-            "verdict": verdict,
-            "map_index": int(record.map_index),
-            "pose": [short(v) for v in record.pose.tolist()] if record.has_pose else None,
+            "verdict": str(verdict[0]),
+            "map_index": int(now.map_index) if status not in SILENT else -1,
+            "pose": [short(v) for v in now.pose.tolist()] if status not in SILENT else None,
+            "probability_wrong": short(float(p[0])),
             "tao": short(row["tao"]),
-            "probability_map_out": None if p is None else short(p),
-            "reason": why,
+            "reason": str(why[0]),
         }
+
+    def _finals(self, finished: list[hindsight.Finished]) -> list[dict[str, Any]]:
+        lines = []
+        for block in finished:
+            columns = hindsight.delayed_columns(
+                self._tables, hindsight.Both(block.now, block.final)
+            )
+            n = len(columns["frame"])
+            before = [self._waiting.popleft() for _ in range(n)]
+            status = np.array([one[1] for one in before], dtype=object)
+            verdict, why, p = judged(self._calibration.final, columns, status)
+            for at, (t_s, said, verdict_now, _) in enumerate(before):
+                is_known = said not in SILENT
+                pose = [short(float(columns[name][at])) for name in POSE]
+                lines.append({
+                    "kind": "final",
+                    "frame": block.first + at,
+                    "t_s": t_s,
+                    "verdict": str(verdict[at]),
+                    "withdrawn": verdict_now == "accept" and verdict[at] != "accept",
+                    "map_index": int(columns["map_index"][at]) if is_known else -1,
+                    "pose": pose if is_known else None,
+                    "covariance": [short(float(columns[n][at])) for n in COVARIANCE],
+                    "probability_wrong": short(float(p[at])),
+                    "reason": str(why[at]),
+                })  # fmt: skip
+            self._n_final += n
+        return lines
 
     def run(self, stream: BinaryIO | BufferedIOBase, write: Callable[[str], object]) -> None:
         """Answer every line of a stream until it ends.
@@ -266,9 +323,12 @@ class Watch:
             try:
                 if line is None:
                     raise LineError(f"is longer than {MOST_BYTES} bytes")
-                said = self.answer(line)
+                lines = self.answer(line)
             except LineError as error:
-                said = {"line": number, "error": str(error)}
+                lines = [{"line": number, "error": str(error)}]
+            for said in lines:
+                write(json.dumps(said))
+        for said in self.flush():
             write(json.dumps(said))
 
     def summary(self) -> str:

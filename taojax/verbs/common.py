@@ -56,6 +56,12 @@ class Common:
     association: Annotated[Literal["rank", "joint"] | None, flag("rank|joint", "joint")] = None
     """What a branch of the signal tao is."""
 
+    max_wrong: Annotated[float | None, flag("SHARE", "0.05")] = None
+    """Share of the accepted answers that may be wrong."""
+
+    lag: Annotated[int | None, flag("FRAMES", "20")] = None
+    """Frames that a final verdict waits for; where frames are dense, what travels as far."""
+
     seed: Annotated[int | None, flag("INT", "0")] = None
     """Seed of the simulated world and of the bootstrap."""
 
@@ -74,7 +80,7 @@ def config_of(args: Common, base: Path | None = None) -> "Config":
 
     path = args.config or base
     config = settings.from_toml(path) if path else settings.Config()
-    names = ("window", "branches", "association", "seed")
+    names = ("window", "branches", "association", "max_wrong", "lag", "seed")
     flags = {name: getattr(args, name) for name in names}
     flags |= {"r_in_m": args.r_in, "r_out_m": args.r_out}
     if args.r_in is not None and args.r_out is None:

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taojax.detector import log_odds_terms
-from taojax.verdicts import STALE, STATUS_MEANS
+from taojax.risk import terms
+from taojax.verdicts import SILENT, STATUS_MEANS
 
 if TYPE_CHECKING:
     from taojax.closures import Verdicts
-    from taojax.detector import Detector
     from taojax.records import Run
+    from taojax.risk import Risk
     from taojax.runtime.explain import Look
 
 WIDTH = 92
@@ -32,7 +32,9 @@ def page(look: "Look", run: "Run", verdicts: "Verdicts | None") -> list[str]:
     parts = [
         ("frame", _frame(look, run)),
         ("verdict", _verdict(look, verdicts)),
-        ("decided by", _decided(look, verdicts)),
+        ("now", _now(look, verdicts)),
+        ("decided by", _decided(look, run, verdicts)),
+        ("promise", "" if verdicts is None else verdicts.calibration.final.promise),
         ("tao", _tao(look)),
         ("place", _place(look)),
         ("branch", _branch(look)),
@@ -60,11 +62,9 @@ def headline(look: "Look", verdicts: "Verdicts | None") -> str:
         return said
     said = f"frame {look.frame}: {verdicts.verdict[look.frame]}"
     said += "" if look.status == "ok" else f", {look.status}"
-    p = verdicts.probability[look.frame]
-    if verdicts.detector is None or not np.isfinite(p):
-        return said
-    limit = verdicts.detector.threshold
-    return f"{said}, probability of being off the map {p:.3f} (threshold {limit:.3f})"
+    p, level = verdicts.probability[look.frame], verdicts.calibration.final.level
+    said += f", probability of being wrong {p:.3f}"
+    return said if np.isnan(level) else f"{said} (accepted up to {level:.3f})"
 
 
 def _frame(look: "Look", run: "Run") -> str:
@@ -82,37 +82,46 @@ def _verdict(look: "Look", verdicts: "Verdicts | None") -> str:
     why = f"{look.status}: {means}" if means else look.status
     if verdicts is None:
         return f"none: nobody decided in this run; status {why}"
-    p, verdict = verdicts.probability[look.frame], verdicts.verdict[look.frame]
-    said = f"{verdict} ({verdicts.source}); status {why}"
-    if verdicts.detector is not None and np.isfinite(p):
-        threshold = verdicts.detector.threshold
-        side = "above" if p > threshold else "below"
-        said += (
-            f"; probability of being off the map {p:.4f}, {abs(p - threshold):.4f} {side} the "
-            f"threshold {threshold:.4f}"
-        )
-    if verdict == "abstain" and look.status == "ok":
-        said += f"; {STALE}"
-    return said
+    at = look.frame
+    return f"{verdicts.verdict[at]} ({verdicts.source}), {verdicts.reason[at]}; status {why}"
 
 
-def _decided(look: "Look", verdicts: "Verdicts | None") -> str:
-    if verdicts is None or verdicts.detector is None:
+def _now(look: "Look", verdicts: "Verdicts | None") -> str:
+    if verdicts is None:
         return ""
-    detector = verdicts.detector
-    terms = _terms(detector, look)
-    told = [f"{name} {term:+.2f} (it is {look.sealed[name]:.3g})" for name, term in terms.items()]
+    at = look.frame
+    apart = np.hypot(*(verdicts.pose[at, :2] - verdicts.pose_now[at, :2]))
+    told = f"{verdicts.verdict_now[at]}, {verdicts.reason_now[at]}"
+    if np.isnan(apart):
+        return told
+    return f"{told}; what came after moved the answer by {apart:.1f} m"
+
+
+MOST_TERMS = 6
+"""Features told, the loudest first."""
+
+
+def _decided(look: "Look", run: "Run", verdicts: "Verdicts | None") -> str:
+    if verdicts is None:
+        return ""
+    risk = verdicts.calibration.final
+    found = _terms(risk, look, run)
+    told = [
+        f"{name} {term:+.2f} (it is {run.delayed[name][look.frame]:.3g})"
+        for name, term in list(found.items())[:MOST_TERMS]
+    ]
+    rest = sum(list(found.values())[MOST_TERMS:])
     return (
-        f"{', '.join(told)}: log odds of being off the map above the mean in-map frame of the "
-        f"calibration, which itself has {detector.bias:+.2f}"
+        f"{', '.join(told)}, {len(found) - MOST_TERMS} more {rest:+.2f}: log odds of being wrong "
+        f"above the mean of the pooled recordings, which itself has {risk.bias:+.2f}"
     )
 
 
-def _terms(detector: "Detector", look: "Look") -> dict[str, float]:
-    """Return what each signal adds to the log odds of the frame, the largest first."""
-    row = {name: np.array([look.sealed[name]]) for name in detector.columns}
-    terms = dict(zip(detector.columns, log_odds_terms(detector, row)[0].tolist(), strict=True))
-    return dict(sorted(terms.items(), key=lambda item: -abs(item[1])))
+def _terms(risk: "Risk", look: "Look", run: "Run") -> dict[str, float]:
+    """Return what each feature adds to the log odds of the final answer, the largest first."""
+    row = {name: run.delayed[name][look.frame : look.frame + 1] for name in risk.columns}
+    found = dict(zip(risk.columns, terms(risk, row)[0].tolist(), strict=True))
+    return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
 
 
 def _tao(look: "Look") -> str:
@@ -228,42 +237,17 @@ def _list(look: "Look") -> str:
 
 
 def _margin(look: "Look", run: "Run", verdicts: "Verdicts | None") -> str:
-    if verdicts is None or verdicts.detector is None:
+    if verdicts is None:
         return ""
-    detector, p = verdicts.detector, verdicts.probability[look.frame]
-    if verdicts.verdict[look.frame] == "accept":
-        return f"log odds higher by {-_excess(look, detector):.2f} would have been rejected"
-    needs = [] if look.status == "ok" else [f"status ok instead of {look.status}"]
-    if look.sealed["stale"] > 0:
-        needs.append("support by the frame itself")
-    if p > detector.threshold:
-        needs.append(_lower(look, run, detector))
-    last = np.flatnonzero(verdicts.verdict[: look.frame] == "accept")
+    risk, at = verdicts.calibration.final, look.frame
+    if look.status in SILENT:
+        return f"to be accepted it lacks an answer of its own: {STATUS_MEANS[look.status]}"
+    if np.isnan(risk.level):
+        return "no answer of this run is accepted: there is no level"
+    excess = sum(_terms(risk, look, run).values()) + risk.bias
+    excess -= np.log(risk.level / (1.0 - risk.level))
+    if verdicts.verdict[at] == "accept":
+        return f"log odds higher by {-excess:.2f} would not have been accepted"
+    last = np.flatnonzero(verdicts.verdict[:at] == "accept")
     before = f"the last accepted frame is {last[-1]}" if last.size else "none before it was"
-    return f"to be accepted it lacks {' and '.join(needs) or 'a threshold'}; {before}"
-
-
-def _excess(look: "Look", detector: "Detector") -> float:
-    """Return how far the log odds lie above the threshold's."""
-    limit = detector.threshold
-    terms = _terms(detector, look)
-    return float(sum(terms.values()) + detector.bias - np.log(limit / (1.0 - limit)))
-
-
-def _lower(look: "Look", run: "Run", detector: "Detector") -> str:
-    """Say how far the log odds must fall, and which signal alone could do it."""
-    terms, excess = _terms(detector, look), _excess(look, detector)
-    ways = []
-    for name in terms:
-        at = detector.columns.index(name)
-        weight = detector.weight[at]
-        if abs(weight) < 1e-6:
-            continue
-        need = look.sealed[name] - excess * detector.scale[at] / weight
-        seen = np.asarray(run.signals[name], float)
-        share = float(np.mean(seen <= need if weight > 0 else seen >= need))
-        if share > 0:
-            bound = "at most" if weight > 0 else "at least"
-            ways.append(f"{name} {bound} {need:.3g} (as {share:.0%} of this run's frames)")
-    alone = f"alone, all else equal: {' or '.join(ways[:3])}" if ways else "no signal alone could"
-    return f"log odds lower by {excess:.2f} ({alone})"
+    return f"to be accepted it lacks log odds lower by {excess:.2f}; {before}"

@@ -78,7 +78,7 @@ def run(args: Rerun) -> None:
             data,
             out,
             from_toml(args.run / "config.toml"),
-            detector=_detector(args.run, sealed),
+            calibration=_calibration(args.run, sealed),
             rival_logs=_rival_logs(sealed),
             progress=args.progress,
         )
@@ -133,9 +133,9 @@ def _check_inputs(data: Path, manifest: Mapping[str, Any]) -> None:
             raise InputError(f"{data / name}: was not there when the run was sealed; move it away")
 
 
-def _detector(run: Path, sealed: "Run") -> Any:
+def _calibration(run: Path, sealed: "Run") -> Any:
     """Return the calibration that decided, where there was one."""
-    from taojax.detector import from_toml
+    from taojax.risk import from_toml
 
     return (
         from_toml(run / "detector.toml") if "detector.toml" in sealed.manifest["sha256"] else None

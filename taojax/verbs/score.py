@@ -2,9 +2,8 @@
 
 import dataclasses
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -23,8 +22,8 @@ class Score(Common):
     dataset: Dataset = tyro.MISSING
     """Data folder, laid out as data_specs/README.md says."""
 
-    calibration: Annotated[Path | None, flag("FILE.toml", "no verdicts at run time")] = None
-    """calibration.toml of an audited run: adds decisions.csv, verdicts at frozen numbers."""
+    calibration: Annotated[Path | None, flag("FILE.toml", "the one that ships")] = None
+    """calibration.toml of an audited run, whose frozen numbers decide (decisions.csv)."""
 
     rivals: bool = False
     """Also run the rank association and every rival: adds tracks.npz. Slow."""
@@ -38,7 +37,7 @@ class Score(Common):
 
 def run(args: Score) -> None:
     """Score a data folder and seal the result."""
-    from taojax.detector import from_toml
+    from taojax.risk import from_toml
     from taojax.runtime.score import score
 
     check_layout(args.dataset, has_truth=False)
@@ -49,12 +48,12 @@ def run(args: Score) -> None:
         raise UsageError("--rival-logs counts from 0 and goes with --rivals")
     if args.rivals and rival_logs is None:
         rival_logs = sys.maxsize
-    detector = None if args.calibration is None else from_toml(args.calibration)
+    calibration = None if args.calibration is None else from_toml(args.calibration)
     manifest = score(
         args.dataset,
         out,
         config,
-        detector=detector,
+        calibration=calibration,
         rival_logs=rival_logs,
         progress=args.progress,
     )
@@ -62,19 +61,14 @@ def run(args: Score) -> None:
         say(f"note: {note}")
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
     if args.advice:
-        say(_next(out, manifest))
+        say(_next(out))
 
 
-def _next(out: Path, manifest: Mapping[str, Any]) -> str:
+def _next(out: Path) -> str:
     """Say what was decided and what can be done with it."""
-    if "decisions.csv" not in manifest["sha256"]:
-        return (
-            "next:   no verdicts yet; add --calibration FILE of an audited run, or judge with"
-            f" taojax evaluate {out} --truth DIR"
-        )
     from taojax.tables import read_table
 
-    verdict = read_table(out / "decisions.csv", "decisions")["verdict"]
+    verdict = read_table(out / "decisions.csv", "verdicts")["verdict"]
     n = {name: int((verdict == name).sum()) for name in ("accept", "reject", "abstain")}
     return (
         f"decided {n['accept']} accepted, {n['reject']} rejected, {n['abstain']} left open"

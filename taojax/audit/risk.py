@@ -1,0 +1,246 @@
+"""Right or wrong: the judge's labels of answers, risk numbers refined by them, risk-coverage."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from taojax.audit.labels import CalibrationSplit
+from taojax.risk import Risk, at_most, probability_wrong
+
+PRIOR_PRECISION = 10.0
+"""How firmly weights hold to the pooled ones before they go half of the way, per unit of log odds
+squared; one labelled effective frame weighs about 1/4. Between 3 and 30 nothing changes by more
+than .01 in recall or wrong share (`python -m benchmarks verdict`)."""
+
+BIAS_PRECISION = 0.05
+"""The same for the bias, which follows how many answers are wrong here."""
+
+OF_THE_WAY = 0.5
+"""Share of the way from the pooled numbers to the fitted ones that is gone: half a recording is a
+narrow view of its other half. All of it accepts .71 of the right answers and .026 wrong ones of
+the left-out recordings, half of it .72 and .022, none of it .68 and .021."""
+
+CORRELATED_FRAMES = 8.0
+"""Neighbouring answers are right and wrong together: so many count as one."""
+
+MOST_EFFECTIVE = 40.0
+"""Effective frames of a class at most, so that a long standstill does not outvote the prior."""
+
+HARSHER = 4.0
+"""The odds of being wrong may be so many times higher on the frames to come than on the
+calibration half: each wrong answer there counts as so many. (mit_corridor: .45 of one half are
+wrong, .80 of the other: odds five times as high.)"""
+
+LEAST_RIGHT = 20
+"""Right answers in the calibration half below which it cannot set a level, only the pooled one."""
+
+LEAST_ACCEPTED = 5
+"""Right answers that a level must accept there to stand."""
+
+
+class Own(NamedTuple):
+    """What became of one kind of answer; frames whose answer is right off the map are neither."""
+
+    is_right: Bool[np.ndarray, " n"]
+    """Within wrong_m of the truth, and a map pose within r_out."""
+
+    is_wrong: Bool[np.ndarray, " n"]
+    """Farther than wrong_m from the truth."""
+
+
+class Answers(NamedTuple):
+    """Right or wrong, now and finally."""
+
+    now: Own
+    final: Own
+
+    def of(self, signal: str) -> Own:
+        """Return the labels by which a signal is judged: the final answer's, but for its own."""
+        return self.now if signal == NOW else self.final
+
+    def at(self, frames: np.ndarray) -> "Answers":
+        """Return the labels of some frames."""
+        return Answers(*(Own(*(part[frames] for part in own)) for own in self))
+
+
+FINAL, NOW = "probability_wrong", "probability_wrong_now"
+"""Rows of metrics.csv."""
+
+
+def own_answers(
+    error_m: Float[np.ndarray, " n"],
+    nearest_m: Float[np.ndarray, " n"],
+    wrong_m: float,
+    r_out_m: float,
+) -> Own:
+    """Label answers by their distance from the truth.
+
+    Args:
+        error_m: distance of the answered from the true position, metres.
+        nearest_m: distance of the true position from the nearest map pose, metres.
+        wrong_m: an answer farther off is wrong.
+        r_out_m: a frame farther from the map has no right closure.
+    """
+    is_near = error_m <= wrong_m
+    return Own(is_near & (nearest_m <= r_out_m), ~is_near)
+
+
+def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> Risk:
+    """Refine the pooled numbers by the labelled answers of a calibration half.
+
+    Args:
+        base: the shipped numbers.
+        split: frames that may be fitted on, with the columns that `base` reads.
+        own: right or wrong, of the same frames.
+        max_wrong: share of the accepted answers that may be wrong.
+
+    Returns:
+        Weights half of the way from the pooled to the fitted ones. The level is the pooled one, or
+        a lower one at which the accepted answers of this half keep the promise though each wrong
+        one counts `HARSHER` times; NaN, and a sentence why, where none does.
+    """
+    from scipy.optimize import minimize
+
+    table = np.stack([np.asarray(split.signals[name], float) for name in base.columns], axis=1)
+    known = own.is_right | own.is_wrong
+    z, y = ((table - base.mean) / base.scale)[known], own.is_wrong[known].astype(float)
+    counts = np.array([(y == 0).sum(), (y == 1).sum()])
+    effective = np.minimum(MOST_EFFECTIVE, counts / CORRELATED_FRAMES) / np.maximum(counts, 1)
+    frame_weight = effective[y.astype(int)]
+    start = np.append(base.weight, base.bias)
+    precision = np.append(np.full(len(base.weight), PRIOR_PRECISION), BIAS_PRECISION)
+
+    def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        odds, pull = z @ numbers[:-1] + numbers[-1], numbers - start
+        surprise = frame_weight * (np.logaddexp(0.0, odds) - y * odds)
+        residual = frame_weight * (1.0 / (1.0 + np.exp(-odds)) - y)
+        slope = np.append(z.T @ residual, residual.sum()) + precision * pull
+        return float(surprise.sum() + 0.5 * np.sum(precision * pull**2)), slope
+
+    fitted = minimize(loss, start, jac=True, method="L-BFGS-B").x
+    numbers = start + OF_THE_WAY * (fitted - start)
+    refined = base._replace(weight=numbers[:-1], bias=float(numbers[-1]))
+    p = probability_wrong(refined, split.signals)
+    levels = np.array([
+        np.minimum(level, checked_level(p, own, most))
+        for level, most in zip(base.levels, base.max_wrongs, strict=True)
+    ])  # fmt: skip
+    refined = at_most(refined._replace(levels=levels), max_wrong)
+    return refined._replace(promise=promise_words(refined, base, p, own))
+
+
+def checked_level(p: Float[np.ndarray, " n"], own: Own, max_wrong: float) -> float:
+    """Return the highest level at which accepted answers keep the promise in a harsher world.
+
+    Args:
+        p: probability of being wrong.
+        own: right or wrong, of the same answers.
+        max_wrong: share of the accepted answers that may be wrong.
+
+    Returns:
+        1 where too few answers are right to tell, NaN where no level keeps it.
+    """
+    if own.is_right.sum() < LEAST_RIGHT:
+        return 1.0
+    known = own.is_right | own.is_wrong
+    order = np.lexsort((~own.is_wrong[known], p[known]))
+    value, wrong = p[known][order], own.is_wrong[known][order]
+    n_wrong, n_right = HARSHER * np.cumsum(wrong), np.cumsum(~wrong)
+    is_last = np.append(value[1:] > value[:-1], True)
+    keeps = is_last & (n_right >= LEAST_ACCEPTED) & (n_wrong <= max_wrong * (n_wrong + n_right))
+    return float(value[np.flatnonzero(keeps)[-1]]) if keeps.any() else float("nan")
+
+
+CONFIDENCE = 0.9
+"""Of the promise, where the calibration half is long enough to make one."""
+
+
+def promise_words(refined: Risk, base: Risk, p: Float[np.ndarray, " n"], own: Own) -> str:
+    """Say what is promised and on what assumption, or what is missing."""
+    from scipy.stats import binom
+
+    most, n_right, n_wrong = refined.max_wrong, int(own.is_right.sum()), int(own.is_wrong.sum())
+    half = f"the calibration half ({n_right} right and {n_wrong} wrong answers)"
+    if np.isnan(refined.level):
+        kept = [m for m, x in zip(refined.max_wrongs, refined.levels, strict=True) if x == x]
+        could = (
+            f"--max-wrong {min(kept):g} could be kept" if kept else "no --max-wrong could be kept"
+        )
+        return (
+            f"nothing is accepted: in {half} even the most trusted answers are wrong too often for "
+            f"{most:.0%} when each wrong one counts {HARSHER:g} times; {could}; better descriptors "
+            "or a longer drive on the map would help"
+        )
+    if n_right < LEAST_RIGHT:
+        return (
+            f"at most {most:.0%} of the accepted answers wrong on the evidence of pooled "
+            f"recordings alone: {half} is too short to check it; {LEAST_RIGHT} right answers are "
+            "needed"
+        )
+    accepted = p <= refined.level
+    n, k = (accepted & (own.is_right | own.is_wrong)).sum(), (accepted & own.is_wrong).sum()
+    blocks, bad = int(n / CORRELATED_FRAMES), int(np.ceil(k / CORRELATED_FRAMES))
+    said = f"{k} of {n} accepted answers are wrong in {half}"
+    if blocks and binom.cdf(bad, blocks, most) <= 1.0 - CONFIDENCE:
+        return (
+            f"at most {most:.0%} of the accepted answers wrong with {CONFIDENCE:.0%} confidence if "
+            f"blocks of {CORRELATED_FRAMES:g} frames are exchangeable: {said}"
+        )
+    need = int(np.ceil(np.log(1.0 - CONFIDENCE) / np.log1p(-most)) * CORRELATED_FRAMES)
+    return (
+        f"at most {most:.0%} of the accepted answers wrong as measured and not proven: {said}; "
+        f"{need} accepted answers without a wrong one would prove it with {CONFIDENCE:.0%} "
+        "confidence"
+    )
+
+
+def _sorted(signal: np.ndarray, own: Own) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return wrong and right so far, and where ties end, most trusted first; ties count against."""
+    known = own.is_right | own.is_wrong
+    order = np.lexsort((~own.is_wrong[known], signal[known]))
+    value, wrong = signal[known][order], own.is_wrong[known][order]
+    is_last = np.append(value[1:] > value[:-1], True)[: len(value)]
+    return np.cumsum(wrong), np.cumsum(~wrong), is_last
+
+
+def risk_row(signal: Float[np.ndarray, " n"], own: Own) -> dict[str, float]:
+    """Return the area under the risk-coverage curve and recall at 95 and 99 % precision.
+
+    Args:
+        signal: larger = less trusted.
+        own: right or wrong, of the same answers.
+
+    Returns:
+        Empty without answers or with a NaN; no recall without a right answer.
+
+    Source:
+        Geifman & El-Yaniv, NeurIPS 2017 (selective risk).
+    """
+    if np.isnan(signal).any() or not (own.is_right | own.is_wrong).any():
+        return {}
+    wrong, right, is_last = _sorted(signal, own)
+    row = {"aurc": float(np.mean(wrong / (wrong + right)))}
+    if right[-1]:
+        for name, precision in (("recall_at_p95", 0.95), ("recall_at_p99", 0.99)):
+            keeps = is_last & (right >= precision * (wrong + right))
+            row[name] = float(right[keeps].max() / right[-1]) if keeps.any() else 0.0
+    return row
+
+
+def risk_coverage(
+    signal: Float[np.ndarray, " n"], own: Own, steps: int = 100
+) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+    """Return coverage in even steps, and the share of wrong answers among those accepted.
+
+    Args:
+        signal: larger = less trusted.
+        own: right or wrong, of the same answers.
+        steps: of coverage.
+    """
+    if np.isnan(signal).any() or not (own.is_right | own.is_wrong).any():
+        return np.zeros(0), np.zeros(0)
+    wrong, right, _ = _sorted(signal, own)
+    coverage = np.arange(1, steps + 1) / steps
+    rows = np.maximum(np.ceil(coverage * len(wrong)).astype(int), 1) - 1
+    return coverage, wrong[rows] / (wrong[rows] + right[rows])

@@ -1,0 +1,677 @@
+"""Right or wrong: the causal verdict's signals now, and the final ones a fixed lag later.
+
+The belief over the map's anchors is carried forwards frame by frame. Once the lag has passed, the
+frames that followed are run backwards onto it, block by block: a block of half a lag shares one
+backward pass, so that every frame waits between half a lag and a whole one, nothing is ever looked
+at twice as long, and memory stays constant. The same functions serve a whole log and a live stream.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from tqdm import tqdm
+
+from taojax.config import VerdictConfig
+from taojax.core.belief import (
+    Belief,
+    Places,
+    Reading,
+    carried,
+    carried_back,
+    combined,
+    paced,
+    read,
+    uninformed,
+    weigh,
+)
+from taojax.core.path import Support, Window, support
+from taojax.core.se2 import between, compose, inverse, transform
+from taojax.runtime.maps import MapTables
+from taojax.runtime.scale import rescale
+
+LISTED = 15
+"""Candidates per frame that a path may run through."""
+
+LONGEST = 5
+"""A lag lasts at most so many times its number of frames, where frames are dense."""
+
+SHORT_SHARE, LONG_PAST = 0.25, 3
+"""A short window looks a quarter of the lag to either side; a long one three lags back."""
+
+FARTHEST = 10.0
+"""Distances between answers count up to so many gaps: beyond, wrong is wrong."""
+
+ODDS = 1e-6
+"""Probabilities are kept so far from 0 and 1 before their log odds are taken."""
+
+FEATURES = (
+    "place", "off_map", "elsewhere", "reverse", "rival",
+    "level_short", "level", "level_long", "cost_short", "cost", "cost_long",
+    "vote_short", "vote", "vote_long", "listed", "agree", "agree_long",
+    "shift", "own", "unseen",
+)  # fmt: skip
+"""What is said of an answer, now and finally; larger = more likely wrong. See
+data_specs/delayed.toml."""
+
+
+class Seen(eqx.Module):
+    """Frames made harmless, on the fixed scale; a leading time axis where there are several."""
+
+    odometry: Float[Any, "*t 3"]
+    index: Int[Any, "*t c"]
+    scaled: Float[Any, "*t c"]
+
+
+class State(eqx.Module):
+    """What the causal half remembers; fixed shapes."""
+
+    belief: Belief
+    pending: Float[Array, "3"]
+    past: Seen
+    """The last frames, oldest first, odometry replaced by their poses in the newest frame."""
+
+    answers: Float[Array, "p 3"]
+    """Their own answers, map frame."""
+
+    pace: Float[Array, "p"]
+    """What each counted as a frame, at most 1; 0 before the start."""
+
+    weight: Float[Array, "p"]
+    """What each counted as evidence."""
+
+    way_gaps: Float[Array, "p"]
+    """Way from each to the newest frame."""
+
+
+class Answer(eqx.Module):
+    """One answer and what is said of it."""
+
+    pose: Float[Any, "*t 3"]
+    map_index: Int[Any, "*t"]
+    covariance: Float[Any, "*t 3"]
+    features: Float[Any, "*t f"]
+
+
+def reach_frames(config: VerdictConfig) -> int:
+    """Return the most frames that any window looks back."""
+    return LONGEST * config.window_frames
+
+
+def init(config: VerdictConfig, tables: MapTables) -> State:
+    """Return the state before the first frame."""
+    p = reach_frames(config)
+    return State(
+        belief=uninformed(config, tables.places.grid.xy.shape[0]),
+        pending=jnp.zeros(3),
+        past=Seen(jnp.zeros((p, 3)), jnp.full((p, LISTED), -1), jnp.zeros((p, LISTED))),
+        answers=jnp.zeros((p, 3)),
+        pace=jnp.zeros(p),
+        weight=jnp.zeros(p),
+        way_gaps=jnp.zeros(p),
+    )
+
+
+def frame_pace(places: Places, odometry: Float[Array, "*t 3"]) -> Float[Array, "*t"]:
+    """Return what a motion counts as a frame: 1 from half a gap on, less where frames are dense."""
+    driven = jnp.sqrt(odometry[..., 0] ** 2 + odometry[..., 1] ** 2)
+    return jnp.minimum(1.0, driven / (0.5 * places.gap_m))
+
+
+def _log_odds(p: Array) -> Array:
+    p = jnp.clip(p, ODDS, 1.0 - ODDS)
+    return jnp.log(p) - jnp.log1p(-p)
+
+
+def _features(  # noqa: PLR0913 - what one answer is tried on
+    config: VerdictConfig,
+    places: Places,
+    reading: Reading,
+    window: Window,
+    paces: Float[Array, " w"],
+    answers: Float[Array, "w 3"],
+    own: Float[Array, ""],
+) -> Float[Array, " f"]:
+    """Say of one answer all that a verdict may rest on.
+
+    Args:
+        config: settings.
+        places: the map.
+        reading: the belief's answer.
+        window: frames around it.
+        paces: how many frames away each is, counted by pace; negative before the answered one.
+        answers: the causal answers of those frames.
+        own: distance from the frame's own first candidate, gaps.
+    """
+    span = float(config.window_frames)
+    away = jnp.abs(paces)
+    spans = jnp.stack([
+        away <= SHORT_SHARE * span,
+        away <= span,
+        (away <= span) | ((paces > -LONG_PAST * span) & (paces < 0)),
+    ])  # fmt: skip
+    weight = window.weight[None] * spans
+
+    def tried(weight: Array) -> Support:
+        own_window = eqx.tree_at(lambda w: w.weight, window, weight)
+        return support(config, places.grid.xy, places.gap_m, reading.pose, own_window)
+
+    found = jax.vmap(tried)(weight)
+    said = transform(reading.pose[None], window.xy)
+    tolerance = config.near_gaps + config.drift * window.way_gaps
+    apart = jnp.sqrt(jnp.sum((answers[:, :2] - said) ** 2, axis=1)) / places.gap_m
+    agree = jnp.sum(weight * (apart <= tolerance)[None], axis=1) / jnp.maximum(found.frames, 1e-9)
+    return jnp.concatenate([
+        jnp.stack([
+            _log_odds(1.0 - reading.here),
+            _log_odds(reading.off),
+            _log_odds(1.0 - reading.here - reading.off - reading.turned),
+            _log_odds(reading.turned),
+            jnp.log(jnp.clip(reading.rival, ODDS, 1.0)),
+        ]),
+        1.0 - found.level,
+        found.cost,
+        1.0 - found.vote,
+        1.0 - found.listed[1:2],
+        1.0 - agree[1:],
+        jnp.stack([
+            jnp.minimum(found.shift_gaps[1], FARTHEST), own, 1.0 / (1.0 + found.frames[1])
+        ]),
+    ])  # fmt: skip
+
+
+def _own(places: Places, pose: Array, index: Array) -> Array:
+    """Return how far a frame's own first candidate lies from the answer, gaps, at most 10."""
+    gap = places.grid.xy[jnp.maximum(index[0], 0)] - pose[:2]
+    away = jnp.sqrt(jnp.sum(gap**2)) / places.gap_m
+    return jnp.where(index[0] >= 0, jnp.minimum(away, FARTHEST), FARTHEST)
+
+
+def _push(window: Array, newest: Array) -> Array:
+    return jnp.concatenate([window[1:], newest[None]])
+
+
+@jax.jit
+def advance(
+    config: VerdictConfig, tables: MapTables, state: State, seen: Seen
+) -> tuple[State, Answer]:
+    """Take in one frame and answer it from what came before.
+
+    Args:
+        config: settings.
+        tables: the map.
+        state: of the frame before.
+        seen: the frame, from `clean`.
+    """
+    places = tables.places
+    motion, is_due, pending, weight = paced(config, places, state.pending, seen.odometry)
+    belief = carried(config, places, state.belief, motion, is_due)
+    belief = weigh(belief, seen.index, config.evidence * weight * seen.scaled)
+    reading = read(config, places, belief, pending)
+
+    driven = jnp.sqrt(seen.odometry[0] ** 2 + seen.odometry[1] ** 2) / places.gap_m
+    index, scaled = seen.index[:LISTED], seen.scaled[:LISTED]
+    back = inverse(seen.odometry)
+    poses = _push(compose(jnp.broadcast_to(back, state.past.odometry.shape), state.past.odometry),
+                  jnp.zeros(3))  # fmt: skip
+    pace = _push(state.pace, frame_pace(places, seen.odometry))
+    weights = _push(state.weight, weight)
+    past = Seen(poses, _push(state.past.index, index), _push(state.past.scaled, scaled))
+    answers = _push(state.answers, reading.pose)
+    way = _push(state.way_gaps + driven, jnp.zeros(()))
+    # Frames between each and the newest: the paces of those that follow it.
+    paces = pace - jnp.flip(jnp.cumsum(jnp.flip(pace)))
+    window = Window(poses[:, :2], way, past.index, past.scaled, weights)
+    own = _own(places, reading.pose, index)
+    features = _features(config, places, reading, window, paces, answers, own)
+    answer = Answer(reading.pose, reading.map_index, reading.covariance, features)
+    return State(belief, pending, past, answers, pace, weights, way), answer
+
+
+class Block(eqx.Module):
+    """Frames around some whose final answer is due: `n_past` before, then the block, then the lag.
+
+    Padded to one shape: `is_there` is False for what never was, or comes after the lag.
+    """
+
+    seen: Seen
+    answers: Float[Any, "w 3"]
+    """Causal answers, map frame."""
+
+    is_there: Bool[Any, " w"]
+    start: Belief
+    """Causal belief before the block's first frame."""
+
+    pending: Float[Any, "3"]
+    """And the motion gathered then."""
+
+
+def block_frames(config: VerdictConfig) -> int:
+    """Return how many frames share one backward pass."""
+    return max(1, config.lag // 2)
+
+
+@eqx.filter_jit
+def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) -> Answer:
+    """Answer the frames of a block with what followed.
+
+    Args:
+        config: settings.
+        tables: the map.
+        block: the frames.
+        n_past: frames before the block; static.
+
+    Returns:
+        One answer per frame of the block; what is said of padding means nothing.
+    """
+    places, n = tables.places, block_frames(config)
+    ahead = jax.tree.map(lambda leaf: leaf[n_past:], (block.seen, block.is_there))
+
+    def pace(pending: Array, frame: tuple[Seen, Array]) -> tuple[Array, tuple[Array, ...]]:
+        seen, is_there = frame
+        motion, is_due, after, weight = paced(config, places, pending, seen.odometry)
+        is_due = is_due & is_there
+        weight = jnp.where(is_there, weight, 0.0)
+        after = jnp.where(is_there, after, pending)
+        return after, (motion, is_due, after, weight)
+
+    motion, is_due, since, weight = jax.lax.scan(pace, block.pending, ahead)[1]
+
+    def forth(belief: Belief, frame: tuple) -> tuple[Belief, Belief]:
+        seen, motion, is_due, weight = frame
+        belief = carried(config, places, belief, motion, is_due)
+        belief = weigh(belief, seen.index, config.evidence * weight * seen.scaled)
+        return belief, belief
+
+    mine = jax.tree.map(lambda leaf: leaf[:n], (ahead[0], motion, is_due, weight))
+    forward = jax.lax.scan(forth, block.start, mine)[1]
+
+    def back(belief: Belief, frame: tuple) -> tuple[Belief, None]:
+        seen, motion, is_due, weight = frame
+        belief = weigh(belief, seen.index, config.evidence * weight * seen.scaled)
+        return carried_back(config, places, belief, motion, is_due), None
+
+    # One loop for both parts: what is kept of the frames after the block is not used.
+    every = ahead[0], motion, is_due, weight
+    nothing = uninformed(config, places.grid.xy.shape[0])
+    start, kept = nothing, jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape)), nothing)
+
+    def back_kept(at: Array, carry: tuple[Belief, Belief]) -> tuple[Belief, Belief]:
+        belief, kept = carry
+        row = is_due.shape[0] - 1 - at
+        slot = jnp.where(row < n, row, n)
+        kept = jax.tree.map(lambda all_, one: all_.at[slot].set(one, mode="drop"), kept, belief)
+        return back(belief, jax.tree.map(lambda leaf: leaf[row], every))[0], kept
+
+    backward = jax.lax.fori_loop(0, is_due.shape[0], back_kept, (start, kept))[1]
+
+    # Poses of all frames in the frame of the block's first one: float32 stays exact.
+    odometry = jnp.where(block.is_there[:, None], block.seen.odometry, 0.0)
+
+    def chain(pose: Array, motion: Array) -> tuple[Array, Array]:
+        pose = compose(pose, motion)
+        return pose, pose
+
+    after = jax.lax.scan(chain, jnp.zeros(3), odometry[n_past + 1 :])[1]
+
+    def unchain(pose: Array, motion: Array) -> tuple[Array, Array]:
+        pose = compose(pose, inverse(motion))
+        return pose, pose
+
+    before = jax.lax.scan(unchain, jnp.zeros(3), odometry[1 : n_past + 1], reverse=True)[1]
+    poses = jnp.concatenate([before, jnp.zeros((1, 3)), after])
+    paces = jnp.where(block.is_there, frame_pace(places, odometry), 0.0)
+    frames = jnp.cumsum(paces)
+    way = jnp.cumsum(jnp.sqrt(odometry[:, 0] ** 2 + odometry[:, 1] ** 2)) / places.gap_m
+    all_weight = jnp.minimum(1.0, (way - jnp.concatenate([jnp.zeros(1), way[:-1]]))
+                             * places.gap_m / places.unit_m)  # fmt: skip
+    all_weight = jnp.where(block.is_there, all_weight, 0.0)
+    index, scaled = block.seen.index[:, :LISTED], block.seen.scaled[:, :LISTED]
+
+    def answered(at: Array, forward: Belief, backward: Belief, since: Array) -> Answer:
+        belief = combined(config, forward, backward)
+        reading = read(config, places, belief, since)
+        here = n_past + at
+        local = between(jnp.broadcast_to(poses[here], poses.shape), poses)[:, :2]
+        window = Window(local, jnp.abs(way - way[here]), index, scaled, all_weight)
+        own = _own(places, reading.pose, index[here])
+        features = _features(
+            config, places, reading, window, frames - frames[here], block.answers, own
+        )
+        return Answer(reading.pose, reading.map_index, reading.covariance, features)
+
+    return jax.lax.map(lambda x: answered(*x), (jnp.arange(n), forward, backward, since[:n]))
+
+
+def clean(
+    tables: MapTables, odometry: np.ndarray, index: np.ndarray, similarity: np.ndarray
+) -> Seen:
+    """Make frames harmless and put their similarities on the fixed scale; host side, whole logs.
+
+    Args:
+        tables: the map.
+        odometry: `(T, 3)`.
+        index: `(T, C)`.
+        similarity: `(T, C)`.
+    """
+    is_usable = np.asarray(np.isfinite(odometry).all(axis=1))
+    odometry = np.where(is_usable[:, None], odometry, 0.0).astype(np.float32)
+    m = tables.places.grid.xy.shape[0]
+    is_there = (index >= 0) & (index < m) & np.isfinite(similarity) & is_usable[:, None]
+    scaled = np.asarray(rescale(tables.scale, jnp.asarray(np.where(is_there, similarity, 0.0))))
+    return Seen(odometry, np.where(is_there, index, -1).astype(np.int32),
+                np.where(is_there, scaled, 0.0).astype(np.float32))  # fmt: skip
+
+
+class Both(NamedTuple):
+    """Causal and final answers of a whole log, NumPy."""
+
+    now: Answer
+    final: Answer
+
+
+@eqx.filter_jit
+def advance_blocks(
+    config: VerdictConfig, tables: MapTables, state: State, seen: Seen
+) -> tuple[State, Answer, tuple[Belief, Array]]:
+    """Run `advance` over some whole blocks.
+
+    Args:
+        config: settings.
+        tables: the map.
+        state: before the first frame.
+        seen: `(blocks * n)` frames.
+
+    Returns:
+        The state after them, an answer per frame, and per block what `finish` starts from.
+    """
+    n = block_frames(config)
+
+    def block(state: State, frames: Seen) -> tuple[State, tuple[Answer, tuple[Belief, Array]]]:
+        start = state.belief, state.pending
+        state, answers = jax.lax.scan(
+            lambda carry, frame: advance(config, tables, carry, frame), state, frames
+        )
+        return state, (answers, start)
+
+    blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, n, *leaf.shape[1:]), seen)
+    state, (answers, starts) = jax.lax.scan(block, state, blocks)
+    return state, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), answers), starts
+
+
+class Reach(NamedTuple):
+    """How many frames around each are looked at, by what they count as."""
+
+    back: Int[np.ndarray, " t"]
+    """One window back."""
+
+    far_back: Int[np.ndarray, " t"]
+    """`LONG_PAST` windows back."""
+
+    ahead: Int[np.ndarray, " t"]
+    """One lag ahead; it may lead beyond the end."""
+
+
+def reach(config: VerdictConfig, places: Places, odometry: np.ndarray) -> Reach:
+    """Return for every frame how far its windows reach.
+
+    Where frames are dense, a lag of so many frames lasts until as much way is driven, up to
+    `LONGEST` times as many; a robot that stands still is waited for no longer.
+
+    Args:
+        config: the lag.
+        places: the map.
+        odometry: `(T, 3)`.
+    """
+    pace = np.asarray(frame_pace(places, jnp.asarray(odometry)), float)
+    frames, at = np.cumsum(pace), np.arange(len(pace))
+    slack = 1e-3  # rounding must not cost a frame
+    width, lag = config.window_frames, config.lag
+
+    def before(n: int) -> np.ndarray:
+        back = at - np.searchsorted(frames, frames - n + slack, side="right") + 1
+        return np.clip(back, n, LONGEST * width)
+
+    ahead = np.searchsorted(frames, frames + lag - slack) - at
+    return Reach(before(width), before(LONG_PAST * width), np.clip(ahead, lag, LONGEST * lag))
+
+
+def cut(  # noqa: PLR0913 - a log and where to cut it
+    config: VerdictConfig,
+    seen: Seen,
+    answers: np.ndarray,
+    start: tuple[Belief, Array],
+    at: int,
+    back: int,
+    ahead: int,
+) -> tuple[Block, int]:
+    """Cut a block and the frames around it out of a log, padded to one of two shapes.
+
+    Args:
+        config: settings.
+        seen: the log, NumPy.
+        answers: `(T, 3)` causal answers.
+        start: what `advance_blocks` kept of the block.
+        at: its first frame.
+        back: how many frames its windows reach back, from `reach`.
+        ahead: and ahead.
+
+    Returns:
+        The block, and the number of frames before it.
+    """
+    width, least = config.window_frames, max(config.lag, block_frames(config))
+    side, right = LONG_PAST * width, least
+    if back > side or ahead > right:
+        side, right = LONGEST * width, LONGEST * least
+    rows = np.arange(at - side, at + right + 1)
+    is_there = (rows >= 0) & (rows <= min(at + ahead, len(answers) - 1))
+    row = np.clip(rows, 0, len(answers) - 1)
+
+    def taken(leaf: np.ndarray, fill: int) -> np.ndarray:
+        mask = is_there.reshape(-1, *(1,) * (leaf.ndim - 1))
+        return np.where(mask, leaf[row], fill).astype(leaf.dtype)
+
+    frames = Seen(taken(seen.odometry, 0), taken(seen.index, -1), taken(seen.scaled, 0))
+    return Block(frames, taken(answers, 0), is_there, *start), side
+
+
+CHUNK = 250
+"""Frames per compiled scan, about."""
+
+
+def _joined(parts: list[Answer], total: int) -> Answer:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *parts)
+
+
+def replay_both(
+    config: VerdictConfig, tables: MapTables, seen: Seen, *, progress: bool = False
+) -> Both:
+    """Answer a whole log, now and finally.
+
+    Args:
+        config: settings.
+        tables: the map.
+        seen: from `clean`, NumPy.
+        progress: draw a bar on stderr.
+
+    Returns:
+        Answers as NumPy arrays.
+    """
+    n, total = block_frames(config), len(seen.odometry)
+    width = n * min(max(1, CHUNK // n), -(-total // n))
+    state, nows, starts = init(config, tables), [], []
+    for low in range(0, total, width):
+        room = max(0, low + width - total)
+        fill = Seen(0, -1, 0)
+        part = jax.tree.map(
+            lambda leaf, empty, low=low, room=room: jnp.asarray(np.concatenate(
+                [leaf[low : low + width], np.full((room, *leaf.shape[1:]), empty, leaf.dtype)]
+            )), seen, fill,
+        )  # fmt: skip
+        state, answers, kept = advance_blocks(config, tables, state, part)
+        nows.append(jax.tree.map(np.asarray, answers))
+        kept = jax.tree.map(np.asarray, kept)
+        starts += [jax.tree.map(lambda leaf, b=b: leaf[b], kept) for b in range(width // n)]
+    now = _joined(nows, total)
+    if config.lag == 0:
+        return Both(now, now)
+    far = reach(config, tables.places, seen.odometry)
+    said = {"unit": "block", "disable": not progress, "leave": False, "desc": "looking back"}
+    finals = [
+        final_block(config, tables, seen, now.pose, starts[at // n], at, far)
+        for at in tqdm(range(0, total, n), **said)
+    ]
+    return Both(now, _joined(finals, total))
+
+
+def final_block(  # noqa: PLR0913 - a log and where to cut it
+    config: VerdictConfig,
+    tables: MapTables,
+    seen: Seen,
+    answers: np.ndarray,
+    start: tuple[Belief, Array],
+    at: int,
+    far: Reach,
+) -> Answer:
+    """Answer the block that begins at a frame, finally; some of it may lie beyond the end."""
+    block, n_past = cut(config, seen, answers, start, at, int(far.far_back[at]), int(far.ahead[at]))
+    return jax.tree.map(np.asarray, finish(config, tables, block, n_past))
+
+
+class Finished(NamedTuple):
+    """A block whose final answers are known."""
+
+    first: int
+    """Number of its first frame."""
+
+    now: Answer
+    """Its causal answers."""
+
+    final: Answer
+
+
+class Follower:
+    """Final answers of a live stream: holds the frames that a lag and its windows still need.
+
+    A state that changes, like the process that watches; memory is constant.
+    """
+
+    def __init__(self, config: VerdictConfig, tables: MapTables) -> None:
+        """Start before the first frame."""
+        self._config, self._tables = config, tables
+        self._seen: list[Seen] = []
+        self._now: list[Answer] = []
+        self._starts: list[tuple[Belief, Array]] = []
+        self._first, self._due = 0, 0
+        self.state = init(config, tables)
+
+    def push(self, seen: Seen) -> tuple[Answer, list[Finished]]:
+        """Take in one frame; return its causal answer, and the blocks that are final now.
+
+        Args:
+            seen: one frame from `clean`, without a time axis.
+        """
+        number = self._first + len(self._seen)
+        if number % block_frames(self._config) == 0:
+            self._starts.append((self.state.belief, self.state.pending))
+        self.state, answer = advance(self._config, self._tables, self.state, seen)
+        answer = jax.tree.map(np.asarray, answer)
+        self._seen.append(seen)
+        self._now.append(answer)
+        return answer, self._finished(is_over=False)
+
+    def flush(self) -> list[Finished]:
+        """Return what is left when the stream has ended: what follows will never be known."""
+        return self._finished(is_over=True)
+
+    def _finished(self, *, is_over: bool) -> list[Finished]:
+        config, n = self._config, block_frames(self._config)
+        done = []
+        while self._starts:
+            at, last = self._due - self._first, len(self._seen) - 1
+            if not is_over and last - at < config.lag:
+                break
+            odometry = np.stack([seen.odometry for seen in self._seen])
+            if self._first == 0:
+                odometry[0] = 0.0
+            far = reach(config, self._tables.places, odometry)
+            if at > last or (not is_over and at + int(far.ahead[at]) > last):
+                break
+            seen = jax.tree.map(lambda *leaves: np.stack(leaves), *self._seen)
+            seen = Seen(odometry, seen.index, seen.scaled)
+            now = jax.tree.map(lambda *leaves: np.stack(leaves), *self._now)
+            final = now if config.lag == 0 else final_block(
+                config, self._tables, seen, now.pose, self._starts[0], at, far
+            )  # fmt: skip
+            rows = slice(at, min(at + n, last + 1))
+            of_final = slice(0, rows.stop - rows.start) if config.lag else rows
+            take = lambda answer, rows: jax.tree.map(lambda leaf: leaf[rows], answer)
+            done.append(Finished(self._due, take(now, rows), take(final, of_final)))
+            self._due += n
+            self._starts.pop(0)
+            spare = self._due - self._first - reach_frames(config)
+            if spare > 0:
+                del self._seen[:spare], self._now[:spare]
+                self._first += spare
+        return done
+
+
+def replay_each(
+    config: VerdictConfig,
+    tables: MapTables,
+    seen: Seen,
+    trial_frames: int | None,
+    *,
+    progress: bool = False,
+) -> Both:
+    """Answer a log that may be a row of trials, each from a fresh start.
+
+    Args:
+        config: settings.
+        tables: the map.
+        seen: from `clean`.
+        trial_frames: frames per trial; None = one log.
+        progress: draw a bar on stderr.
+    """
+    if trial_frames is None:
+        return replay_both(config, tables, seen, progress=progress)
+    n = trial_frames
+    starts = range(0, len(seen.odometry), n)
+    said = {"unit": "trial", "disable": not progress, "leave": False, "desc": "looking back"}
+    parts = [
+        replay_both(config, tables, jax.tree.map(lambda leaf, a=a: leaf[a : a + n], seen))
+        for a in tqdm(starts, **said)
+    ]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def now_columns(now: Answer) -> dict[str, np.ndarray]:
+    """Return the causal columns of signals.csv."""
+    return {
+        "now_map_index": np.asarray(now.map_index),
+        "now_x_m": now.pose[:, 0],
+        "now_y_m": now.pose[:, 1],
+        "now_theta_rad": now.pose[:, 2],
+        **{f"now_{name}": now.features[:, at] for at, name in enumerate(FEATURES)},
+    }
+
+
+def delayed_columns(tables: MapTables, both: Both) -> dict[str, np.ndarray]:
+    """Return the columns of delayed.csv."""
+    final = both.final
+    moved = np.hypot(*(final.pose[:, :2] - both.now.pose[:, :2]).T) / float(tables.places.gap_m)
+    return {
+        "frame": np.arange(len(moved)),
+        "map_index": np.asarray(final.map_index),
+        "x_m": final.pose[:, 0],
+        "y_m": final.pose[:, 1],
+        "theta_rad": final.pose[:, 2],
+        "var_x_m2": final.covariance[:, 0],
+        "var_y_m2": final.covariance[:, 1],
+        "cov_xy_m2": final.covariance[:, 2],
+        **{name: final.features[:, at] for at, name in enumerate(FEATURES)},
+        "change": np.minimum(moved, FARTHEST),
+    }
