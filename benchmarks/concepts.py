@@ -104,7 +104,7 @@ def level(run: Path) -> Figure:
             style = "stepfilled" if label == "in_map" else "step"
             ax.hist(odds[chosen], edges, histtype=style, color=colour, label=name, linewidth=1.8)
         ax.axvline(
-            at, color=INK, linestyle="--", label="frozen: the highest level that keeps the promise"
+            at, color=INK, linestyle="--", label="frozen: highest level that keeps the promise"
         )
         ax.set_xlabel("log odds that the final answer is wrong")
         ax.set_title(title, fontsize=10)

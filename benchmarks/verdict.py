@@ -125,7 +125,10 @@ def pooled(recordings: Sequence[Judged], kind: str, promise: str) -> Risk:
         value = np.sum(w * (np.logaddexp(0.0, odds) - y * odds)) + 0.5 * RIDGE * np.sum(q[:-1] ** 2)
         return float(value), np.append(z.T @ residual + RIDGE * q[:-1], residual.sum())
 
-    q = minimize(loss, np.zeros(z.shape[1] + 1), jac=True, method="L-BFGS-B").x
+    # Larger features mean more likely wrong. With free weights twice as many answers that are
+    # accepted on left-out recordings are wrong, at the same recall.
+    bounds = [(0.0, None)] * z.shape[1] + [(None, None)]
+    q = minimize(loss, np.zeros(z.shape[1] + 1), jac=True, method="L-BFGS-B", bounds=bounds).x
     shares = np.array(MAX_WRONGS)
     levels = LEVEL_OVER_SHARE * shares
     return Risk(columns_of(kind), mean, scale, q[:-1], float(q[-1]), shares, levels, 0.05, promise)

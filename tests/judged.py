@@ -7,6 +7,8 @@ from taojax import records
 from taojax.audit import figures
 from taojax.audit.evaluate import evaluate
 from taojax.config import AuditConfig, Config, StreamConfig, to_toml
+from taojax.risk import shipped
+from taojax.specs import column_names
 
 N_CANDIDATES = 100
 
@@ -25,6 +27,35 @@ def world(n=240, *, always_in=False, seed=7):
     phase = (map_x / x[-1] * 6) % 2  # three stretches with a map, three without
     keep = np.full(len(map_x), True) if always_in else phase < 1.2
     return truth, np.stack([map_x[keep], np.zeros(keep.sum())], axis=1)
+
+
+def features(columns, is_wrong, rng, numbers):
+    """Return made-up features of answers, on which shipped numbers tell most wrong from right."""
+    n = len(is_wrong)
+    loud = np.where(is_wrong, 0.5, -0.5) + 0.3 * rng.normal(size=n)
+    at = {name: i for i, name in enumerate(numbers.columns)}
+    sign = lambda name: np.sign(numbers.weight[at[name]])
+    return {
+        name: numbers.mean[at[name]]
+        + numbers.scale[at[name]] * (sign(name) * loud + 0.1 * rng.normal(size=n))
+        for name in columns
+    }
+
+
+def answered(answer, map_index, is_wrong, rng):
+    """Return the causal columns of signals.csv, and delayed.csv, of one row of answers."""
+    said = {"map_index": map_index, "x_m": answer[:, 0], "y_m": answer[:, 1]}
+    said["theta_rad"] = np.zeros(len(answer))
+    pose = {"now_" + name: values for name, values in said.items()}
+    first, last = (
+        [name for name in column_names(spec) if name in numbers.columns]
+        for spec, numbers in (("signals", shipped().now), ("delayed", shipped().final))
+    )
+    now = pose | features(first, is_wrong, rng, shipped().now)
+    spread = {name: np.full(len(answer), v) for name, v in
+              (("var_x_m2", 0.5), ("var_y_m2", 0.5), ("cov_xy_m2", 0.0))}  # fmt: skip
+    final = {"frame": np.arange(len(answer))} | said | spread
+    return now, final | features(last, is_wrong, rng, shipped().final)
 
 
 def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulated",)):
@@ -47,11 +78,14 @@ def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulat
     for number, name in enumerate(records.signal_names()):
         signals[name] = rng.normal(0, 1, n) + (0.3 * (number % 8)) * is_out
     signals["tao"] = signals["tao_geom"] + signals["tao_vel"] + signals["tao_sim"] + 4.0 * is_out
+    is_wrong = np.hypot(*(answer - truth).T) > config().audit.wrong_m
+    now, delayed = answered(answer, index[:, 0], is_wrong, rng)
     blank = np.full((len(map_m), 2), 0.0)
     run = folder / "run"
     records.write_run(
         run,
-        signals=signals,
+        signals=signals | now,
+        delayed=delayed,
         map_poses={"t_s": np.arange(len(map_m)), "x_m": map_m[:, 0], "y_m": map_m[:, 1]}
         | {"theta_rad": blank[:, 0]},
         index=index,

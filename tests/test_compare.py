@@ -25,6 +25,7 @@ def reseal(run, out, config=None, manifest=None, **changes):
     records.write_run(
         out,
         signals=old.signals | changes,
+        delayed=old.delayed,
         map_poses=old.map_poses,
         index=old.index,
         similarity=old.similarity,

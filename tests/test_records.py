@@ -8,20 +8,28 @@ import pytest
 
 from taojax import records
 from taojax.errors import InputError
-from taojax.specs import load_spec
+from taojax.specs import column_names, load_spec
 
 
 def table(n=30):
-    out = {name: np.linspace(0, 1, n, dtype=np.float32) for name in records.signal_names()}
+    out = {name: np.linspace(0, 1, n, dtype=np.float32) for name in column_names("signals")}
     blank = np.full(n, np.nan)
     return out | {
         "frame": np.arange(n),
         "t_s": np.arange(n) * 0.1,
         "status": np.array(["ok"] * n, dtype=object),
         "map_index": np.full(n, -1),
+        "now_map_index": np.full(n, -1),
         "x_m": blank,
         "y_m": blank,
         "theta_rad": blank,
+    }
+
+
+def delayed(n=30):
+    return {name: np.linspace(0, 1, n) for name in column_names("delayed")} | {
+        "frame": np.arange(n),
+        "map_index": np.zeros(n, int),
     }
 
 
@@ -31,6 +39,7 @@ def write(out, **changes):
     return records.write_run(
         out,
         signals=table(n) | changes,
+        delayed=delayed(n),
         map_poses=poses,
         index=np.zeros((n, 100), np.int32),
         similarity=np.ones((n, 100), np.float32),

@@ -75,15 +75,15 @@ def view_map(descriptors: np.ndarray, xy: np.ndarray, spacing_m: float) -> MapVi
     return MapView(np.array([background, strong]), float(is_near.mean()))
 
 
-def rescale(scale: Float[Array, "2"], similarity: Float[Array, " c"]) -> Float[Array, " c"]:
-    """Put one frame's similarities on the fixed scale.
+def rescale(scale: Float[Array, "2"], similarity: Float[Array, "*t c"]) -> Float[Array, "*t c"]:
+    """Put similarities on the fixed scale.
 
     Args:
         scale: `(2,)` background and strong similarity.
-        similarity: `(c,)` raw.
+        similarity: `(c,)` raw; a leading time axis where there are several frames.
 
     Returns:
-        `(c,)` values in [0, 1].
+        Values in [0, 1].
     """
     scaled = (similarity - scale[0]) / jnp.maximum(scale[1] - scale[0], LEAST_RANGE)
     return jnp.clip(scaled, 0.0, 1.0)
