@@ -7,7 +7,7 @@ from taojax import records
 from taojax.audit import figures
 from taojax.audit.evaluate import evaluate
 from taojax.config import AuditConfig, Config, StreamConfig, to_toml
-from taojax.risk import shipped
+from taojax.risk import Calibration, Risk, shipped
 from taojax.specs import column_names
 
 N_CANDIDATES = 100
@@ -29,33 +29,40 @@ def world(n=240, *, always_in=False, seed=7):
     return truth, np.stack([map_x[keep], np.zeros(keep.sum())], axis=1)
 
 
+def made_up(name="cost", middle=0.5, gain=8.0, **changes):
+    """Return numbers that look at one feature, now and finally: wrong from `middle` on."""
+    one, share = np.ones(1), np.array([0.05])
+    now = Risk(("now_" + name,), middle * one, one, gain * one, 0.0, share, 0.3 * one, 0.05,
+               "made up")  # fmt: skip
+    return Calibration(now, now._replace(columns=(name,)), **changes)
+
+
 def features(columns, is_wrong, rng, numbers):
     """Return made-up features of answers, on which shipped numbers tell most wrong from right."""
     n = len(is_wrong)
     loud = np.where(is_wrong, 0.5, -0.5) + 0.3 * rng.normal(size=n)
-    at = {name: i for i, name in enumerate(numbers.columns)}
-    sign = lambda name: np.sign(numbers.weight[at[name]])
-    return {
-        name: numbers.mean[at[name]]
-        + numbers.scale[at[name]] * (sign(name) * loud + 0.1 * rng.normal(size=n))
-        for name in columns
-    }
+    found = {name: rng.normal(size=n) for name in columns}
+    for name, mean, scale, weight in zip(
+        numbers.columns, numbers.mean, numbers.scale, numbers.weight, strict=True
+    ):
+        found[name] = mean + scale * (np.sign(weight) * loud + 0.1 * found[name])
+    return found
 
 
 def answered(answer, map_index, is_wrong, rng):
     """Return the causal columns of signals.csv, and delayed.csv, of one row of answers."""
     said = {"map_index": map_index, "x_m": answer[:, 0], "y_m": answer[:, 1]}
     said["theta_rad"] = np.zeros(len(answer))
-    pose = {"now_" + name: values for name, values in said.items()}
-    first, last = (
-        [name for name in column_names(spec) if name in numbers.columns]
-        for spec, numbers in (("signals", shipped().now), ("delayed", shipped().final))
-    )
-    now = pose | features(first, is_wrong, rng, shipped().now)
+    now = [name for name in column_names("signals") if name.startswith("now_")]
+    final = list(column_names("delayed"))
     spread = {name: np.full(len(answer), v) for name, v in
               (("var_x_m2", 0.5), ("var_y_m2", 0.5), ("cov_xy_m2", 0.0))}  # fmt: skip
-    final = {"frame": np.arange(len(answer))} | said | spread
-    return now, final | features(last, is_wrong, rng, shipped().final)
+    pose = {f"now_{name}": values for name, values in said.items()}
+    return (
+        features(now, is_wrong, rng, shipped().now) | pose,
+        features(final, is_wrong, rng, shipped().final)
+        | {"frame": np.arange(len(answer))} | said | spread,
+    )  # fmt: skip
 
 
 def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulated",)):

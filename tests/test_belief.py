@@ -94,7 +94,8 @@ def test_a_step_moves_the_belief_by_a_step_and_leaves_a_little_off_the_map(place
     # `leave` counts per unit of way, and three gaps are more than one unit of an unknown map.
     assert 0.9 * CONFIG.leave < float(ahead.off) < 0.1
     other = Belief(jnp.zeros((2, M)).at[1, 20].set(1.0), jnp.zeros(()))
-    assert int(jnp.argmax(step(CONFIG, places, other, jnp.array([3 * GAP, 0.0, 0.0])).mass[1])) == 17
+    back = step(CONFIG, places, other, jnp.array([3 * GAP, 0.0, 0.0]))
+    assert int(jnp.argmax(back.mass[1])) == 17
 
 
 def test_the_inverse_motion_carries_it_back(places):
@@ -170,7 +171,8 @@ def test_without_evidence_nothing_is_certain(places):
     said = drive(places, DRIVEN, [[]] * 30)
     assert float(said[-1].here) < 0.1
     # Where leaving and coming back balance.
-    assert float(said[-1].off) == pytest.approx(CONFIG.leave / (CONFIG.leave + CONFIG.come_back), abs=0.02)
+    balance = CONFIG.leave / (CONFIG.leave + CONFIG.come_back)
+    assert float(said[-1].off) == pytest.approx(balance, abs=0.02)
 
 
 def test_covariance_is_that_of_one_place_and_at_least_a_cell(places):
@@ -299,8 +301,8 @@ def test_forward_and_backward_are_those_of_a_dense_hidden_markov_model(rng):
         ours.append(belief)
         np.testing.assert_allclose(flat(belief), alpha, atol=1e-5)
 
-    # Backwards the filter starts from its prior and runs over reversed motions; `combined` takes out
-    # the prior that both halves hold. The textbook's messages are columns of the same transition.
+    # Backwards the filter starts from its prior and runs over reversed motions; `combined` takes
+    # out the prior that both halves hold. The textbook's messages are columns of the transition.
     behind, theirs, beta, apart = prior, flat(prior), np.ones(2 * m + 1), []
     for t in range(n - 1, -1, -1):
         got = flat(combined(CONFIG, ours[t], behind))

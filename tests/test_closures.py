@@ -9,15 +9,15 @@ import subprocess
 import numpy as np
 import pytest
 from conftest import write_folder
-from judged import seal
+from judged import made_up, seal
 
 from taojax import closures, records
 from taojax.cli import main
-from taojax.detector import Detector, to_toml
 from taojax.errors import InputError
-from taojax.tables import read_table
+from taojax.risk import to_toml
+from taojax.tables import read_table, table_text
 
-FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+FLAGS = ["--window", "6", "--branches", "5", "--lag", "4", "--no-progress"]
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +26,8 @@ def scored(tmp_path_factory):
     folder = tmp_path_factory.mktemp("closures")
     data = write_folder(folder / "data", np.random.default_rng(3))
     assert main(["score", str(data), "--out", str(folder / "first"), *FLAGS]) == 0
-    level = np.quantile(records.read_run(folder / "first").signals["tao"], 0.7)
-    one = np.ones(1)
-    made_up = Detector(("tao",), level * one, one, 9.0 * one, 0.0, 0.5, "made up")
-    (folder / "calibration.toml").write_text(to_toml(made_up))
+    level = np.quantile(records.read_run(folder / "first").delayed["place"], 0.7)
+    (folder / "calibration.toml").write_text(to_toml(made_up("place", middle=level)))
     words = ["--out", str(folder / "run"), "--calibration", str(folder / "calibration.toml")]
     assert main(["score", str(data), *words, *FLAGS]) == 0
     assert main(["closures", str(folder / "run")]) == 0
@@ -43,17 +41,18 @@ def run(scored):
 
 @pytest.fixture(scope="module")
 def verdict(run):
-    return read_table(run / "decisions.csv", "decisions")["verdict"]
+    return records.read_run(run).decisions["verdict"]
 
 
 def judged(scored, folder, seal=None):
-    """Copy the run without verdicts and give it those of a judge."""
+    """Copy the run and give it the verdicts of a judge, who accepts every answer."""
     shutil.copytree(scored / "first", folder)
     sealed = records.read_manifest(folder)["seal"]
     (folder / "audit.json").write_text(json.dumps({"run_seal": seal or sealed}))
-    rows = [f"{t},accept,0.1,made up" for t in range(50)]
-    head = "frame,verdict,probability_map_out,reason"
-    (folder / "verdicts.csv").write_text("\n".join([head, *rows]) + "\n")
+    table = records.read_run(folder).decisions
+    everything = {"verdict": np.full(50, "accept"), "reason": np.full(50, "made up")}
+    (folder / "verdicts.csv").write_text(table_text("verdicts", table | everything))
+    shutil.copy(scored / "calibration.toml", folder)
     return folder
 
 
@@ -110,8 +109,8 @@ def test_a_closure_leads_from_its_map_pose_to_the_answered_pose(run):
         if not a < 60 <= b:
             continue
         t = b - 60
-        assert a == sealed.signals["map_index"][t]
-        want = [sealed.signals[c][t] for c in ("x_m", "y_m", "theta_rad")]
+        assert a == sealed.delayed["map_index"][t]
+        want = [sealed.delayed[c][t] for c in ("x_m", "y_m", "theta_rad")]
         np.testing.assert_allclose(matrix(vertices[a]) @ matrix(motion), matrix(want), atol=1e-6)
         np.testing.assert_allclose(vertices[b], want, atol=1e-6)
         delta = 3.0 * sealed.manifest["map_spacing_m"]
@@ -138,9 +137,9 @@ def test_the_trajectory_holds_the_accepted_poses_and_full_stamps(run, verdict):
     sealed = records.read_run(run)
     rows = np.flatnonzero(verdict == "accept")
     np.testing.assert_array_equal(table["t_s"], sealed.signals["t_s"][rows])
-    np.testing.assert_allclose(table["x_m"], sealed.signals["x_m"][rows], atol=1e-6)
+    np.testing.assert_allclose(table["x_m"], sealed.delayed["x_m"][rows], atol=1e-6)
     theta = 2 * np.arctan2(table["qz"], table["qw"])
-    want = sealed.signals["theta_rad"][rows].astype(float)
+    want = sealed.delayed["theta_rad"][rows]
     np.testing.assert_allclose(np.cos(theta - want), 1.0, atol=1e-9)
 
 
@@ -209,8 +208,9 @@ def fails(capsys, *words):
     return line
 
 
-def test_a_run_without_verdicts_says_what_to_do(scored, capsys):
-    assert "taojax evaluate" in fails(capsys, "closures", str(scored / "first"))
+def test_a_run_without_verdicts_says_what_to_do(tmp_path, capsys):
+    run, _ = seal(tmp_path)
+    assert "taojax evaluate" in fails(capsys, "closures", str(run))
 
 
 @pytest.mark.parametrize("name", ["labels.csv", "verdicts.csv"])
@@ -231,10 +231,14 @@ def test_tables_of_other_frames_are_refused_before_anything_is_written(
     assert not out.exists()
 
 
-def test_without_verdicts_of_its_own_a_run_has_the_judges(scored, tmp_path, capsys):
+def test_the_judge_who_knows_the_place_comes_first(scored, tmp_path, capsys):
     folder, out = judged(scored, tmp_path / "run"), tmp_path / "elsewhere"
+    assert closures.read_verdicts(folder, records.read_run(folder)).source == "verdicts.csv"
     assert main(["closures", str(folder), "--out", str(out)]) == 0
-    assert "verdicts.csv" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "verdicts of verdicts.csv" in said
+    # The first two frames have no answer that could close anything.
+    assert "48 accepted closures" in said
     names = {path.name for path in out.iterdir()}
     assert names == {"closures.g2o", "rejected.g2o", "trajectory.tum"}
 
@@ -252,10 +256,17 @@ def test_every_frame_is_counted_once(run, tmp_path, capsys):
     assert sum(counts) == 50
 
 
-def test_the_detector_is_sealed_with_its_decisions(run, tmp_path, capsys):
+def test_what_decided_is_sealed_with_its_decisions(run, tmp_path, capsys):
     sealed = closures.read_verdicts(run, records.read_run(run))
     assert sealed.source == "decisions.csv"
-    assert sealed.detector.columns == ("tao",)
+    assert sealed.calibration.final.columns == ("place",)
+    assert sealed.calibration.now.columns == ("now_place",)
+    assert set(sealed.verdict) == {"accept", "reject", "abstain"}
+    assert np.isfinite(sealed.probability).all()
+    assert np.isnan(sealed.pose[:2]).all()
+    assert np.isfinite(sealed.pose[2:]).all()
+    assert np.isfinite(sealed.pose_now[2:]).all()
+    assert (sealed.map_index[:2] == -1).all()
     broken = tmp_path / "run"
     shutil.copytree(run, broken)
     raw = (broken / "detector.toml").read_text()
@@ -269,9 +280,8 @@ def test_verdicts_of_another_run_are_refused(scored, tmp_path):
         closures.read_verdicts(folder, records.read_run(folder))
 
 
-def test_a_run_sealed_without_odometry_is_told_to_score_again(tmp_path):
+def test_a_run_sealed_without_odometry_is_told_to_score_again(run, tmp_path):
     folder, _ = seal(tmp_path)
-    sealed = records.read_run(folder)
-    verdicts = closures.Verdicts("x", np.array(["accept"] * 240), np.zeros(240), None, None)
+    verdicts, sealed = closures.read_verdicts(run, records.read_run(run)), records.read_run(folder)
     with pytest.raises(InputError, match="score the data set again"):
         closures.build_graph(folder, sealed, verdicts)

@@ -7,21 +7,19 @@ import shutil
 import numpy as np
 import pytest
 from conftest import write_folder
-from judged import seal
+from judged import made_up, seal
 
 from taojax import records
 from taojax.cli import main
-from taojax.config import Config, StreamConfig
-from taojax.detector import Detector
+from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.errors import InputError
 from taojax.runtime.explain import TOLERANCE, explain
 from taojax.runtime.score import score
 from taojax.verbs.explain_page import ranges
 
 SHAPE = {"window": 6, "branches": 5, "joint_window": 8, "joint_seeds": 3}
-CALIBRATION = Detector(
-    ("tao", "top1_w5"), np.array([0.3, 0.3]), np.ones(2), np.array([6.0, 1.0]), 0.0, 0.5, "made up"
-)
+LAG = VerdictConfig(lag=4, window_frames=4)
+CALIBRATION = made_up("place", middle=-9.0, gain=2.0)
 
 
 def lost_folder(folder):
@@ -40,8 +38,8 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("explain")
     data = lost_folder(folder / "data")
     for name in ("joint", "rank"):
-        config = Config(stream=StreamConfig(**SHAPE, association=name))
-        score(data, folder / name, config, detector=CALIBRATION)
+        config = Config(stream=StreamConfig(**SHAPE, association=name), verdict=LAG)
+        score(data, folder / name, config, calibration=CALIBRATION)
     # What explains a run must lie in the run.
     shutil.rmtree(data)
     return folder
@@ -100,7 +98,7 @@ def test_no_later_frame_is_looked_at(folder, monkeypatch):
 def test_a_trial_is_explained_from_its_own_start(tmp_path):
     data = lost_folder(tmp_path / "data")
     (data / "about.toml").write_text('notes = ["made up"]\ntrial_frames = 25\n')
-    config = Config(stream=StreamConfig(**SHAPE, association="rank"))
+    config = Config(stream=StreamConfig(**SHAPE, association="rank"), verdict=LAG)
     score(data, tmp_path / "run", config)
     run = records.read_run(tmp_path / "run")
     look = explain(tmp_path / "run", run, 27)
@@ -116,7 +114,18 @@ def told(capsys, *words):
 @pytest.mark.parametrize("name", ["joint", "rank"])
 def test_it_says_verdict_signals_branch_frames_and_margin_and_draws(name, folder, tmp_path, capsys):
     text = told(capsys, folder / name, "--frame", 47, "--out", tmp_path / "out")
-    for label in ("verdict", "decided by", "tao", "window", "costs", "rival", "list", "margin"):
+    for label in (
+        "verdict",
+        "now",
+        "decided by",
+        "promise",
+        "tao",
+        "window",
+        "costs",
+        "rival",
+        "list",
+        "margin",
+    ):
         assert f"\n{label} " in text, label
     assert "decisions.csv" in text
     assert max(map(len, text.splitlines())) <= 92
@@ -134,7 +143,10 @@ def test_it_says_verdict_signals_branch_frames_and_margin_and_draws(name, folder
 def test_a_rejected_frame_and_an_accepted_one_say_so(folder, capsys, tmp_path):
     verdicts = (folder / "joint/decisions.csv").read_text().splitlines()[1:]
     said = {row.split(",")[1]: int(row.split(",")[0]) for row in verdicts}
-    for verdict, words in (("reject", "to be accepted it lacks"), ("accept", "would have been")):
+    for verdict, words in (
+        ("reject", "to be accepted it lacks log odds lower by"),
+        ("accept", "would not have been accepted"),
+    ):
         text = told(capsys, folder / "joint", "--frame", said[verdict], "--out", tmp_path)
         assert f"verdict     {verdict}" in text
         assert words in " ".join(text.split())

@@ -53,6 +53,7 @@ def test_what_is_written_is_read_back(tmp_path):
     run = records.read_run(tmp_path / "run")
     assert run.manifest == sealed
     np.testing.assert_array_equal(run.signals["tao"].astype(np.float32), table()["tao"])
+    np.testing.assert_allclose(run.delayed["place"], delayed()["place"], rtol=1e-8)
     assert np.isnan(run.signals["x_m"]).all()
     assert set(run.signals["status"]) == {"ok"}
 
@@ -91,6 +92,20 @@ def test_an_odd_manifest_is_refused(body, tmp_path):
     (tmp_path / "run" / "manifest.json").write_text(body)
     with pytest.raises(InputError, match=r"manifest\.json"):
         records.read_run(tmp_path / "run")
+
+
+def test_a_run_of_the_first_version_is_refused_in_one_line(tmp_path):
+    write(tmp_path / "run")
+    path = tmp_path / "run" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    assert manifest["schema"] == records.SCHEMA == 2
+    old = manifest | {"schema": 1}
+    path.write_text(json.dumps(old | {"seal": records.seal_of(old)}))
+    with pytest.raises(
+        InputError, match=r"sealed by taojax 0\.1\.0.*score the data set again"
+    ) as told:
+        records.read_run(tmp_path / "run")
+    assert "\n" not in str(told.value)
 
 
 def test_a_missing_file_is_refused(tmp_path):

@@ -9,16 +9,19 @@ import sys
 import numpy as np
 import pytest
 from conftest import ALONE, write_folder
+from judged import made_up
 
 from taojax import records
 from taojax.cli import main
-from taojax.config import Config, StreamConfig, to_toml
-from taojax.detector import Detector
-from taojax.detector import to_toml as detector_toml
+from taojax.config import Config, StreamConfig, VerdictConfig, to_toml
+from taojax.risk import to_toml as calibration_toml
 from taojax.runtime.score import score
 from taojax.verbs import rerun
 
-SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(
+    stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3),
+    verdict=VerdictConfig(lag=4, window_frames=4),
+)
 
 PROCESSES = {
     "another process": {},
@@ -50,9 +53,7 @@ def home(tmp_path_factory):
     home = tmp_path_factory.mktemp("home")
     write_folder(home / "data", np.random.default_rng(5))
     score(home / "data", home / "run", SMALL)
-    one = np.ones(1)
-    detector = Detector(("tao",), 0.5 * one, one, one, 0.0, 0.5, "made up")
-    (home / "calibration.toml").write_text(detector_toml(detector))
+    (home / "calibration.toml").write_text(calibration_toml(made_up("place", middle=-9.0)))
     return home
 
 
@@ -122,7 +123,7 @@ def test_another_process_makes_the_same_bytes(home, elsewhere):
 def test_threads_and_devices_change_signals_by_no_more_than_the_tolerance(name, home, elsewhere):
     run, (n_devices, n_cores) = elsewhere[name]
     assert (n_devices, n_cores == "1") == (("1", True) if name == "one thread" else ("8", False))
-    for file in ("signals.csv", "retrievals.npz", "map_poses.csv"):
+    for file in ("signals.csv", "delayed.csv", "retrievals.npz", "map_poses.csv"):
         verdict = rerun._by_value(home / "run" / file, run / file)
         assert verdict.is_close, verdict.text
 
@@ -264,10 +265,14 @@ def test_other_code_and_versions_are_named(home, copy, capsys):
 
 
 NO_RUNS = {
-    "a summary": ({"schema": 1, "scenarios": {}}, "holds several scenarios"),
+    "a summary": ({"schema": records.SCHEMA, "scenarios": {}}, "holds several scenarios"),
     "a sweep": (
-        {"schema": 1, "sha256": {"signals.npz": "0" * 64, "config.toml": "0" * 64}},
+        {"schema": records.SCHEMA, "sha256": {"signals.npz": "0" * 64, "config.toml": "0" * 64}},
         "was not made by score",
+    ),
+    "a run of 0.1.0": (
+        {"schema": 1, "sha256": {name: "0" * 64 for name in records.SEALED}},
+        "was sealed by taojax 0.1.0, which had no final verdicts; score the data set again",
     ),
     "anything": ([], "is not the manifest of a run"),
 }
@@ -308,5 +313,5 @@ def tracks(n_ran, n=40):
     ],
 )
 def test_rivals_are_run_again_on_as_many_trials_as_before(held, length, want):
-    run = records.Run({}, {}, np.zeros(1), np.zeros(1), "", {"trial_frames": length}, held)
+    run = records.Run({}, {}, {}, np.zeros(1), np.zeros(1), "", {"trial_frames": length}, held)
     assert rerun._rival_logs(run) == want

@@ -11,12 +11,14 @@ from judged import evaluated, seal
 
 import taojax
 from taojax import records
-from taojax.config import Config, StreamConfig
-from taojax.detector import from_toml
+from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.errors import InputError
 from taojax.results import SUMMARIES
+from taojax.risk import from_toml
 from taojax.runtime.score import score
 from taojax.specs import column_names
+
+ANSWERED = ("probability_wrong_now", "probability_wrong")
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def test_a_judged_run_comes_back_whole(judged):
         np.testing.assert_allclose(run.signals[name], judgement.signals[name], rtol=1e-8)
     np.testing.assert_array_equal(run.labels["label"], judgement.label)
     np.testing.assert_array_equal(run.verdicts["verdict"], judgement.verdicts["verdict"])
-    assert list(run.metrics.index) == [*records.signal_names(), "fused"]
+    assert list(run.metrics.index) == [*records.signal_names(), *ANSWERED, "fused"]
     at = list(judgement.metrics["signal"]).index("tao")
     assert run.metrics.loc["tao", "auroc"] == pytest.approx(judgement.metrics["auroc"][at])
     assert np.isnan(run.metrics.loc["fused", "n_in"])
@@ -54,7 +56,7 @@ def test_a_judged_run_comes_back_whole(judged):
 
 def test_the_tables_join_by_frame_and_count_as_the_judge_does(judged):
     run = taojax.read_run(str(judged[0]))
-    frames = run.signals.join(run.labels).join(run.verdicts)
+    frames = run.signals.join(run.labels).join(run.verdicts, rsuffix="_final")
     assert len(frames) == 240
     test = frames[(frames["split"] == "test") & (frames["label"] != "grey")]
     counted = test["label"].value_counts()
@@ -89,15 +91,18 @@ def test_the_judge_may_have_written_elsewhere(spoilt, tmp_path):
 
 
 def test_what_was_decided_at_run_time_comes_along(judged, data_folder, tmp_path):
-    config = Config(stream=StreamConfig(window=6, branches=5, association="rank"))
+    config = Config(
+        stream=StreamConfig(window=6, branches=5, association="rank"),
+        verdict=VerdictConfig(lag=4, window_frames=4),
+    )
     score(
         data_folder,
         tmp_path / "out",
         config,
-        detector=from_toml(judged[0] / "calibration.toml"),
+        calibration=from_toml(judged[0] / "calibration.toml"),
     )
     run = taojax.read_run(tmp_path / "out")
-    assert (run.decisions.index.name, *run.decisions.columns) == column_names("decisions")
+    assert (run.decisions.index.name, *run.decisions.columns) == column_names("verdicts")
     assert len(run.decisions) == len(run.signals) == 50
 
 

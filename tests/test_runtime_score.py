@@ -2,14 +2,21 @@
 
 import numpy as np
 from conftest import table, write_folder
+from judged import made_up
 
 from taojax import records
-from taojax.config import Config, StreamConfig
-from taojax.detector import Detector, MapFacts
+from taojax.config import Config, StreamConfig, VerdictConfig, replace
+from taojax.detector import MapFacts
+from taojax.risk import from_toml, shipped
+from taojax.runtime import hindsight
 from taojax.runtime.score import score
 from taojax.runtime.watch import load_map
+from taojax.specs import column_names
 
-SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(
+    stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3),
+    verdict=VerdictConfig(lag=4, window_frames=4),
+)
 
 
 def scored(folder, out):
@@ -19,6 +26,12 @@ def scored(folder, out):
     assert set(run.signals["status"]) <= statuses
     for name in records.signal_names():
         assert np.isfinite(run.signals[name].astype(float)).all(), name
+    for name in column_names("delayed"):
+        assert np.isfinite(run.delayed[name]).all(), name
+    for name in shipped().now.columns:
+        assert np.isfinite(run.signals[name]).all(), name
+    for name in ("probability_wrong", "probability_wrong_now"):
+        assert np.isfinite(run.decisions[name]).all(), name
     return run
 
 
@@ -35,14 +48,15 @@ def test_twelve_map_frames_and_unnormalised_descriptors(rng, tmp_path):
 
 
 def test_a_calibration_of_another_map_is_noted_in_the_seal(rng, tmp_path):
-    folder, one = write_folder(tmp_path / "data", rng), np.ones(1)
+    folder = write_folder(tmp_path / "data", rng)
     seen = load_map(folder, SMALL.stream).facts
     notes = {}
     for name, facts in (("same", seen), ("foreign", MapFacts("ab12", "", 2.0, 0.9)), ("old", None)):
-        made_up = Detector(("tao",), one, one, one, 0.0, 0.5, "made up", facts)
-        score(folder, tmp_path / name, SMALL, detector=made_up)
+        score(folder, tmp_path / name, SMALL, calibration=made_up(fitted_on=facts))
         notes[name] = records.read_manifest(tmp_path / name)["notes"]
-    assert notes["same"] == notes["old"] == []
+    assert notes["same"] == []
+    assert len(notes["old"]) == 1
+    assert "ships with taojax" in notes["old"][0]
     assert len(notes["foreign"]) == 1
     assert "fitted on another map (spacing 2 m" in notes["foreign"][0]
 
@@ -67,18 +81,37 @@ def test_lists_without_any_candidate_have_no_pose(rng, tmp_path):
     assert np.isnan(run.signals["x_m"].astype(float)).all()
 
 
-def test_an_acceptance_at_run_time_needs_a_status_of_ok_and_a_fresh_frame(rng, tmp_path):
-    from taojax.verdicts import decide
-
-    one = np.ones(1)
-    detector = Detector(("tao",), 0 * one, one, one, 0.0, 0.5, "made up")
-    got = decide(
-        detector,
-        {
-            "frame": np.arange(4),
-            "status": np.array(["ok", "lost", "ok", "ok"], dtype=object),
-            "tao": np.array([-1.0, -1.0, 1.0, -1.0]),
-            "stale": np.array([0.0, 0.0, 1.0, 1.0]),
-        },
+def test_without_a_calibration_the_shipped_one_decides_and_the_seal_says_so(rng, tmp_path):
+    run = scored(write_folder(tmp_path / "data", rng), tmp_path / "run")
+    assert len(run.manifest["notes"]) == 1
+    assert run.manifest["notes"][0].startswith(
+        "decided with the calibration that ships with taojax"
     )
-    assert got["verdict"].tolist() == ["accept", "abstain", "reject", "abstain"]
+    assert {"decisions.csv", "detector.toml", "delayed.csv"} <= set(run.manifest["sha256"])
+    assert from_toml(tmp_path / "run/detector.toml").final.levels.tolist() == (
+        shipped().final.levels.tolist()
+    )
+    assert set(run.decisions["verdict"][:2]) == {"abstain"}
+    assert "accept" in run.decisions["verdict"]
+
+
+def test_without_hindsight_both_verdicts_are_one(rng, tmp_path):
+    folder = write_folder(tmp_path / "data", rng)
+    score(folder, tmp_path / "run", replace(SMALL, {"lag": 0}))
+    run = records.read_run(tmp_path / "run")
+    for name in ("verdict", "probability_wrong"):
+        np.testing.assert_array_equal(run.decisions[name], run.decisions[f"{name}_now"])
+    said = [reason.replace("now_", "") for reason in run.decisions["reason_now"]]
+    assert run.decisions["reason"].tolist() == said
+    np.testing.assert_array_equal(run.decisions["x_m"], run.decisions["x_now_m"])
+    assert (run.delayed["change"] == 0).all()
+    for name in hindsight.FEATURES:
+        np.testing.assert_array_equal(run.delayed[name], run.signals[f"now_{name}"])
+
+
+def test_the_share_that_may_be_wrong_is_sealed_with_the_numbers(rng, tmp_path):
+    folder = write_folder(tmp_path / "data", rng)
+    score(folder, tmp_path / "run", replace(SMALL, {"max_wrong": 0.1}))
+    sealed = from_toml(tmp_path / "run/detector.toml")
+    assert sealed.now.max_wrong == sealed.final.max_wrong == 0.1
+    assert sealed.final.level == shipped().final.levels[3]

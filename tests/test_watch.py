@@ -12,23 +12,22 @@ import sys
 import numpy as np
 import pytest
 from conftest import write_folder
+from judged import made_up
 
 from taojax import records
 from taojax.cli import main
-from taojax.config import Config, StreamConfig, to_toml
-from taojax.detector import Detector
-from taojax.detector import to_toml as detector_toml
+from taojax.config import Config, StreamConfig, VerdictConfig, to_toml
 from taojax.errors import InputError
+from taojax.risk import to_toml as calibration_toml
 from taojax.runtime.score import score
 from taojax.runtime.watch import MOST_BYTES, LineError, Watch, load_map, parse
 from taojax.tables import read_table
 
 SHAPE = {"window": 6, "branches": 5, "joint_window": 8, "joint_seeds": 3}
-CONFIG = Config(stream=StreamConfig(**SHAPE))
-RANK = Config(stream=StreamConfig(**SHAPE, association="rank"))
-CALIBRATION = Detector(
-    ("tao", "top1_w5"), np.array([0.3, 0.3]), np.ones(2), np.array([6.0, 1.0]), 0.0, 0.5, "made up"
-)
+LAG = VerdictConfig(lag=4, window_frames=4)
+CONFIG = Config(stream=StreamConfig(**SHAPE), verdict=LAG)
+RANK = Config(stream=StreamConfig(**SHAPE, association="rank"), verdict=LAG)
+CALIBRATION = made_up("place", middle=-9.0, gain=2.0)
 GOOD = {"odometry": [1.0, 0.0, 0.1], "index": [3, 4], "similarity": [0.9, 0.5]}
 
 
@@ -49,10 +48,10 @@ def feed(run):
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("watch")
     data = write_folder(folder / "data", np.random.default_rng(5))
-    score(data, folder / "run", CONFIG, detector=CALIBRATION)
+    score(data, folder / "run", CONFIG, calibration=CALIBRATION)
     # Rank branches compile faster, and a process of its own has nothing compiled yet.
     (folder / "config.toml").write_text(to_toml(RANK))
-    (folder / "calibration.toml").write_text(detector_toml(CALIBRATION))
+    (folder / "calibration.toml").write_text(calibration_toml(CALIBRATION))
     (folder / "feed.jsonl").write_text("\n".join(feed(folder / "run")) + "\n")
     return folder
 
@@ -62,11 +61,16 @@ def tables(folder):
     return load_map(folder / "data", CONFIG.stream)[0]
 
 
-def watched(tables, raw, detector=None):
+def watched(tables, raw, calibration=None, config=CONFIG):
     """Run bytes through a fresh watcher; return the answers and the summary."""
-    watcher, out = Watch(CONFIG.stream, tables, detector), []
+    watcher, out = Watch(config, tables, calibration), []
     watcher.run(io.BytesIO(raw), lambda line: out.append(json.loads(line)))
     return out, watcher.summary()
+
+
+def kind(rows, name):
+    """Return the lines of one kind: now or final."""
+    return [row for row in rows if row.get("kind") == name]
 
 
 def same_but_for_time(a, b):
@@ -76,27 +80,65 @@ def same_but_for_time(a, b):
 
 @pytest.mark.parametrize("config", [CONFIG, RANK], ids=["joint", "rank"])
 def test_the_columns_are_those_of_score(config, folder, tmp_path):
-    score(folder / "data", tmp_path / "run", config, detector=CALIBRATION)
-    want = records.read_run(tmp_path / "run").signals
-    decided = read_table(tmp_path / "run/decisions.csv", "decisions")
-    watcher, out = Watch(
-        config.stream, load_map(folder / "data", config.stream)[0], CALIBRATION
-    ), []  # fmt: skip
-    watcher.run(io.BytesIO((folder / "feed.jsonl").read_bytes()), lambda s: out.append(s))
-    rows = [json.loads(line) for line in out]
-    assert [row["frame"] for row in rows] == list(range(50))
+    score(folder / "data", tmp_path / "run", config, calibration=CALIBRATION)
+    run = records.read_run(tmp_path / "run")
+    tables = load_map(folder / "data", config.stream)[0]
+    out, _ = watched(tables, (folder / "feed.jsonl").read_bytes(), CALIBRATION, config)
+    want, decided = run.signals, run.decisions
+    rows, finals = kind(out, "now"), kind(out, "final")
+    assert len(out) == 100
+    for found, end, silent in ((rows, "_now", "now_"), (finals, "", "")):
+        assert [row["frame"] for row in found] == list(range(50))
+        assert [row["verdict"] for row in found] == decided["verdict" + end].tolist()
+        p = [row["probability_wrong"] for row in found]
+        np.testing.assert_allclose(p, decided["probability_wrong" + end], rtol=1e-6)
+        pose = np.array([row["pose"] or [np.nan] * 3 for row in found])
+        names = [f"{name}{end}_{unit}" for name, unit in (("x", "m"), ("y", "m"), ("theta", "rad"))]
+        sealed = np.stack([decided[name].astype(float) for name in names], axis=1)
+        np.testing.assert_allclose(pose, sealed, rtol=1e-6, atol=1e-6)
+        assert [row["t_s"] for row in found] == want["t_s"].tolist()
+        assert [row["reason"] for row in found] == decided["reason" + end].tolist()
+        index = (run.delayed if silent == "" else run.signals)[silent + "map_index"]
+        assert [row["map_index"] for row in found] == [-1, -1, *index[2:]]
     assert [row["status"] for row in rows] == want["status"].tolist()
-    assert [row["map_index"] for row in rows] == want["map_index"].tolist()
-    assert [row["verdict"] for row in rows] == decided["verdict"].tolist()
-    p = [row["probability_map_out"] for row in rows]
-    np.testing.assert_allclose(p, decided["probability_map_out"], atol=1e-5)
     np.testing.assert_allclose([row["tao"] for row in rows], want["tao"], rtol=1e-5, atol=1e-5)
-    pose = np.array([row["pose"] or [np.nan] * 3 for row in rows])
-    sealed = np.stack([want[c].astype(float) for c in ("x_m", "y_m", "theta_rad")], axis=1)
-    np.testing.assert_allclose(pose, sealed, atol=1e-3)
-    assert [row["t_s"] for row in rows] == want["t_s"].tolist()
-    assert len({row["verdict"] for row in rows}) >= 2
-    assert all(row["reason"] for row in rows)
+    names = ("var_x_m2", "var_y_m2", "cov_xy_m2")
+    sealed = np.stack([run.delayed[name] for name in names], axis=1)
+    np.testing.assert_allclose([row["covariance"] for row in finals], sealed, rtol=1e-6, atol=1e-9)
+    assert len({row["verdict"] for row in finals}) >= 2
+    accepted = decided["verdict_now"] == "accept"
+    withdrawn = accepted & (decided["verdict"] != "accept")
+    assert [row["withdrawn"] for row in finals] == withdrawn.tolist()
+
+
+def test_a_final_line_comes_a_lag_later_and_the_last_ones_with_the_end(folder, tables):
+    watcher = Watch(CONFIG, tables, CALIBRATION)
+    due = {}
+    for t, line in enumerate((folder / "feed.jsonl").read_bytes().splitlines()):
+        now, *finals = watcher.answer(line)
+        assert (now["kind"], now["frame"]) == ("now", t)
+        for row in finals:
+            assert row["kind"] == "final"
+            due[row["frame"]] = t - row["frame"]
+    rest = watcher.flush()
+    assert [*due, *(row["frame"] for row in rest)] == list(range(50))
+    # A block of half a lag is final once a lag has passed since its first frame.
+    assert {due[t] for t in due if t > 0 and t % 2 == 0} <= set(range(4, 6))
+    assert {row["kind"] for row in rest} == {"final"}
+    assert len(rest) <= 5
+    assert watcher.flush() == []
+
+
+def test_an_acceptance_that_is_not_kept_is_withdrawn(folder, tables):
+    # Causal answers are accepted throughout, final ones never.
+    eager = CALIBRATION._replace(
+        now=CALIBRATION.now._replace(weight=np.zeros(1), bias=-5.0),
+        final=CALIBRATION.final._replace(weight=np.zeros(1), bias=0.3),
+    )
+    out, _ = watched(tables, (folder / "feed.jsonl").read_bytes(), eager)
+    assert [row["verdict"] for row in kind(out, "now")] == ["abstain"] * 2 + ["accept"] * 48
+    assert [row["verdict"] for row in kind(out, "final")] == ["abstain"] * 2 + ["reject"] * 48
+    assert [row["withdrawn"] for row in kind(out, "final")] == [False] * 2 + [True] * 48
 
 
 def test_lists_of_ones_own_frontend_keep_their_own_scale(folder, tmp_path):
@@ -109,16 +151,19 @@ def test_lists_of_ones_own_frontend_keep_their_own_scale(folder, tmp_path):
     assert "as they are" in words
     out, _ = watched(tables, (folder / "feed.jsonl").read_bytes())
     want = records.read_run(tmp_path / "run").signals["tao"]
-    np.testing.assert_allclose([row["tao"] for row in out], want, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose([row["tao"] for row in kind(out, "now")], want, rtol=1e-5, atol=1e-5)
 
 
-def test_without_a_calibration_nothing_is_decided(folder, tables):
+def test_without_a_calibration_the_shipped_one_decides(folder, tables, tmp_path):
+    score(folder / "data", tmp_path / "run", CONFIG)
+    decided = records.read_run(tmp_path / "run").decisions
     out, summary = watched(tables, (folder / "feed.jsonl").read_bytes())
-    assert {row["verdict"] for row in out} == {None}
-    assert {row["probability_map_out"] for row in out} == {None}
+    assert [row["verdict"] for row in kind(out, "final")] == decided["verdict"].tolist()
+    assert [row["verdict"] for row in kind(out, "now")] == decided["verdict_now"].tolist()
+    assert "accept" in decided["verdict"]
     assert summary.startswith("50 frames answered; latency p50 ")
     assert "p99" in summary
-    assert all(row["latency_ms"] > 0 for row in out)
+    assert all(row["latency_ms"] > 0 for row in kind(out, "now"))
 
 
 def bad(**changes):
@@ -196,19 +241,26 @@ def test_a_list_longer_than_what_is_used_is_cut_and_a_short_one_filled(tables):
 def test_a_line_without_candidates_is_a_frame_like_any_other(tables):
     line = json.dumps({"odometry": [1, 0, 0], "index": [], "similarity": []})
     out, _ = watched(tables, "\n".join([line] * 4).encode(), CALIBRATION)
+    out, finals = kind(out, "now"), kind(out, "final")
+    assert len(finals) == 4
+    assert {row["verdict"] for row in finals} == {"abstain"}
+    assert {row["pose"] for row in finals} == {None}
     assert [row["status"] for row in out] == ["warming_up"] * 2 + ["no_candidates"] * 2
     assert {row["verdict"] for row in out} == {"abstain"}
     assert out[-1]["pose"] is None
 
 
-def test_nothing_is_compiled_once_lines_come(tables):
+def test_nothing_is_compiled_once_lines_come(folder, tables):
+    from taojax.runtime import hindsight
     from taojax.runtime.stream import step
 
-    watcher = Watch(CONFIG.stream, tables, CALIBRATION)
-    before = step._cache_size()
-    for _ in range(5):
-        watcher.answer(json.dumps(GOOD).encode())
-    assert step._cache_size() == before
+    watcher = Watch(CONFIG, tables, CALIBRATION)
+    sizes = lambda: [made._cache_size() for made in (step, hindsight.advance)]
+    before, many = sizes(), hindsight.finish._cached._cache_size()
+    for line in (folder / "feed.jsonl").read_bytes().splitlines()[:20]:
+        watcher.answer(line)
+    assert sizes() == before
+    assert hindsight.finish._cached._cache_size() == many
 
 
 def test_a_plain_map_folder_will_do(folder, tmp_path):

@@ -29,6 +29,10 @@ class Track(NamedTuple):
     may_accept: Bool[np.ndarray, " t"]
     """The method itself does not abstain: its status is ok and its pose fresh."""
 
+    level: float | None = None
+    """Threshold of the signal where the method brings its own; None = frozen on calibration
+    frames."""
+
 
 class Event(NamedTuple):
     """One kidnap or one re-entry."""

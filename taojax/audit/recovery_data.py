@@ -84,12 +84,26 @@ def _tracks(run: Run, place_m: Float[np.ndarray, "t 2"]) -> dict[str, Track]:
     if "stale" in signals:
         may_accept = may_accept & (signals["stale"] <= 0)
     found = {"tao": Track(np.where(np.isnan(away), np.inf, away), signals["tao"], may_accept)}
+    if run.decisions is not None:
+        found |= {name: _verdict_track(run.decisions, name, place_m) for name in ("final", "now")}
     for name, track in (run.tracks or {}).items():
         away = np.hypot(*(track.pose[:, :2].astype(float) - place_m).T)
         error = np.where(track.has_pose, away, np.inf)
         # Tables are plain CSV: a name in them holds no comma.
         found[name.replace(",", "")] = Track(error, track.signal.astype(float), track.has_pose)
     return found
+
+
+def _verdict_track(
+    decisions: Mapping[str, np.ndarray], name: str, place_m: Float[np.ndarray, "t 2"]
+) -> Track:
+    """Return a verdict as a track: accepted or not, at a level that was frozen elsewhere."""
+    end = "" if name == "final" else "_now"
+    x, y, verdict = f"x{end}_m", f"y{end}_m", f"verdict{end}"
+    away = np.hypot(decisions[x] - place_m[:, 0], decisions[y] - place_m[:, 1])
+    has = np.isfinite(away)
+    is_accepted = np.asarray(decisions[verdict]) == "accept"
+    return Track(np.where(has, away, np.inf), np.where(is_accepted, 0.0, 1.0), has, level=0.5)
 
 
 def _events(trials: Trials) -> list[Event]:
@@ -168,7 +182,12 @@ def measure(
         track = run.tracks[method]
         chosen = run.may_fit & (run.drift == drift) & (track.error_m <= rules.basin_m)
         fitted.append(track.signal[chosen & np.isfinite(track.signal)])
-    threshold = accepting_level(np.concatenate([np.zeros(0), *fitted]))
+    own = [run.tracks[method].level for run in runs]
+    threshold = (
+        own[0]
+        if own and own[0] is not None
+        else accepting_level(np.concatenate([np.zeros(0), *fitted]))
+    )
     outcomes = [
         outcome(
             run.tracks[method], run.place_m, event, threshold,

@@ -13,7 +13,7 @@ from taojax.audit.recovery_data import Judged, Measured, Rules, levels, measure
 MOST_FRAMES = 30
 """Length of the recovery curves: the shortest stretch."""
 
-OURS = ("tao", "tao_rank")
+OURS = ("tao", "final", "now", "tao_rank")
 
 
 def curves(behind: Mapping[tuple[str, str], Measured], *, simulated: str) -> Picture:

@@ -121,8 +121,8 @@ def support(
         pose=fitted,
         shift_gaps=jnp.sqrt(jnp.sum((fitted[:2] - pose[:2]) ** 2)) / gap_m,
         cost=jnp.sum(window.weight * price[rows, chosen]) / total,
-        vote=jnp.sum(window.weight * (relative[:, 0] <= 1.0)) / total,
-        listed=jnp.sum(window.weight * jnp.any(relative <= 1.0, axis=1)) / total,
+        vote=jnp.sum(jnp.where(relative[:, 0] <= 1.0, window.weight, 0.0)) / total,
+        listed=jnp.sum(jnp.where(jnp.any(relative <= 1.0, axis=1), window.weight, 0.0)) / total,
         level=jnp.sum(window.weight * jnp.where(window.index[:, 0] >= 0, window.scaled[:, 0], 0.0))
         / total,
         frames=jnp.sum(window.weight),

@@ -50,9 +50,10 @@ ODDS = 1e-6
 
 FEATURES = (
     "place", "off_map", "elsewhere", "reverse", "rival",
-    "level_short", "level", "level_long", "cost_short", "cost", "cost_long",
-    "vote_short", "vote", "vote_long", "listed", "agree", "agree_long",
-    "shift", "own", "unseen",
+    "level_short", "level", "level_long",
+    "cost_short", "cost", "cost_long",
+    "vote_short", "vote", "vote_long",
+    "listed", "agree", "own", "unseen",
 )  # fmt: skip
 """What is said of an answer, now and finally; larger = more likely wrong. See
 data_specs/delayed.toml."""
@@ -153,7 +154,7 @@ def _features(  # noqa: PLR0913 - what one answer is tried on
         away <= span,
         (away <= span) | ((paces > -LONG_PAST * span) & (paces < 0)),
     ])  # fmt: skip
-    weight = window.weight[None] * spans
+    weight = jnp.where(spans, window.weight[None], 0.0)
 
     def tried(weight: Array) -> Support:
         own_window = eqx.tree_at(lambda w: w.weight, window, weight)
@@ -163,7 +164,7 @@ def _features(  # noqa: PLR0913 - what one answer is tried on
     said = transform(reading.pose[None], window.xy)
     tolerance = config.near_gaps + config.drift * window.way_gaps
     apart = jnp.sqrt(jnp.sum((answers[:, :2] - said) ** 2, axis=1)) / places.gap_m
-    agree = jnp.sum(weight * (apart <= tolerance)[None], axis=1) / jnp.maximum(found.frames, 1e-9)
+    agree = jnp.sum(jnp.where(apart <= tolerance, weight[2], 0.0))
     return jnp.concatenate([
         jnp.stack([
             _log_odds(1.0 - reading.here),
@@ -175,10 +176,11 @@ def _features(  # noqa: PLR0913 - what one answer is tried on
         1.0 - found.level,
         found.cost,
         1.0 - found.vote,
-        1.0 - found.listed[1:2],
-        1.0 - agree[1:],
         jnp.stack([
-            jnp.minimum(found.shift_gaps[1], FARTHEST), own, 1.0 / (1.0 + found.frames[1])
+            1.0 - found.listed[1],
+            1.0 - agree / jnp.maximum(found.frames[2], 1e-9),
+            own,
+            1.0 / (1.0 + found.frames[1]),
         ]),
     ])  # fmt: skip
 
@@ -443,7 +445,7 @@ def cut(  # noqa: PLR0913 - a log and where to cut it
     config: VerdictConfig,
     seen: Seen,
     answers: np.ndarray,
-    start: tuple[Belief, Array],
+    start: tuple[Belief, Array | np.ndarray],
     at: int,
     back: int,
     ahead: int,
@@ -505,12 +507,12 @@ def replay_both(
     state, nows, starts = init(config, tables), [], []
     for low in range(0, total, width):
         room = max(0, low + width - total)
-        fill = Seen(0, -1, 0)
-        part = jax.tree.map(
-            lambda leaf, empty, low=low, room=room: jnp.asarray(np.concatenate(
+        leaves = ((seen.odometry, 0), (seen.index, -1), (seen.scaled, 0))
+        part = Seen(*(
+            jnp.asarray(np.concatenate(
                 [leaf[low : low + width], np.full((room, *leaf.shape[1:]), empty, leaf.dtype)]
-            )), seen, fill,
-        )  # fmt: skip
+            )) for leaf, empty in leaves
+        ))  # fmt: skip
         state, answers, kept = advance_blocks(config, tables, state, part)
         nows.append(jax.tree.map(np.asarray, answers))
         kept = jax.tree.map(np.asarray, kept)
@@ -532,7 +534,7 @@ def final_block(  # noqa: PLR0913 - a log and where to cut it
     tables: MapTables,
     seen: Seen,
     answers: np.ndarray,
-    start: tuple[Belief, Array],
+    start: tuple[Belief, Array | np.ndarray],
     at: int,
     far: Reach,
 ) -> Answer:

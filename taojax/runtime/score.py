@@ -184,7 +184,7 @@ def score(
     used = for_run(calibration or shipped(), config.audit.max_wrong, config.verdict.lag)
     if said := foreign_map(used.fitted_on, map_of(known_map)):
         notes.append(said)
-    if calibration is None:
+    if used.fitted_on is None:
         notes.append(f"decided with {SHIPPED}: no frame of this place has set its level")
     return write_run(
         out,
