@@ -48,7 +48,8 @@ class StreamConfig(eqx.Module):
     mask, >= 0: no support is as bad as support at the mask. Its similarity counts as 0."""
 
     delta_spacings: Scalar = 3.0
-    """Huber threshold as a multiple of the map's median spacing, > 0."""
+    """Huber threshold as a multiple of the map's median spacing, > 0. A joint branch finds support
+    within 9 spacings of an anchor, so 6 is the largest that acts in full there."""
 
     mask_deltas: Scalar = 3.0
     """Residual mask as a multiple of the Huber threshold, > 0."""

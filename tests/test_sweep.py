@@ -68,7 +68,7 @@ def swept():
     rows = grids.expand(parsed(GRID), BASE)
     tables = map_tables(poses, BASE)
     found = {}
-    for signals, units in plan(rows, BASE, tables, poses, frames):
+    for signals, units in plan(rows, BASE, tables, frames):
         for members, values in evaluate(signals, units, batch=1):
             found |= dict(zip(members, values, strict=True))
     return rows, poses, frames, np.stack([found[n] for n in range(len(rows))])
@@ -95,7 +95,7 @@ def test_no_two_configurations_give_the_same_signal_by_accident(swept):
 
 def test_vmap_gives_what_the_loop_gives_with_a_last_batch_that_is_not_full(swept):
     rows, poses, frames, tao = swept
-    for signals, units in plan(rows, BASE, map_tables(poses, BASE), poses, frames):
+    for signals, units in plan(rows, BASE, map_tables(poses, BASE), frames):
         part = units[:5]
         found = list(evaluate(signals, part, batch=3))
         assert [r for members, _ in found for r in members] == [r for u in part for r in u.rows]
@@ -105,7 +105,7 @@ def test_vmap_gives_what_the_loop_gives_with_a_last_batch_that_is_not_full(swept
 
 def test_units_share_the_fit_of_gamma_and_branches(swept):
     rows, poses, frames, _ = swept
-    (_, units), _ = plan(rows, BASE, map_tables(poses, BASE), poses, frames)
+    (_, units), _ = plan(rows, BASE, map_tables(poses, BASE), frames)
     assert len(units) == 8
     assert sorted(r for u in units for r in u.rows) == list(range(32))
 

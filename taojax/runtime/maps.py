@@ -15,7 +15,9 @@ NEIGHBOURS = 12
 """Anchors pooled around each anchor."""
 
 REACH_DELTAS = 3.0
-"""A grid cell knows an anchor within so many Huber thresholds."""
+"""A grid cell knows an anchor within so many Huber thresholds, the default ones: the tables depend
+on no setting, so that every setting may be swept under `vmap`. Support ends at 1.5 thresholds, so
+up to twice the default nothing is cut off; beyond, support ends at this reach."""
 
 ON_EDGES = 0.1
 """Share of anchors that one corner must serve better than the other to be preferred."""
@@ -61,10 +63,9 @@ def map_spacing_m(xy: np.ndarray) -> float:
     return float(np.median(steps[steps >= 0.25 * np.quantile(steps, 0.9)]))
 
 
-def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
+def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
     xy = poses[:, :2]
     tree = KDTree(xy)
-    reach = REACH_DELTAS * delta_m
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     cell_m = max(spacing_m, float((high - low).max()) / MAX_CELLS)
     low = _corner(tree, low, cell_m)
@@ -75,7 +76,6 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
     n_neighbours = min(NEIGHBOURS, len(xy))
     gap, neighbour = tree.query(xy, k=n_neighbours)
     gap, neighbour = gap.reshape(len(xy), -1).T, neighbour.reshape(len(xy), -1).T
-    r = gap / delta_m
     return AnchorGrid(
         xy=jnp.asarray(xy, jnp.float32),
         theta=jnp.asarray(poses[:, 2], jnp.float32),
@@ -86,7 +86,6 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float) -> AnchorGrid:
         cell_m=jnp.asarray(cell_m, jnp.float32),
         neighbour=jnp.asarray(neighbour, jnp.int32),
         neighbour_m2=jnp.asarray(gap**2, jnp.float32),
-        neighbour_cost=jnp.asarray(np.where(r <= 1, 0.5 * r**2, r - 0.5), jnp.float32),
     )
 
 
@@ -111,19 +110,19 @@ def map_tables(
 
     Args:
         poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
-        config: sets the Huber threshold in map spacings; defaults when omitted.
+        config: changes nothing: the tables serve every setting.
         descriptors: `(M, D)` of the map images; they fix the similarity scale and the recall,
             which are 0 to 1 and 0.75 when omitted.
     """
-    config = StreamConfig() if config is None else config
     poses = np.asarray(poses, float)
     spacing_m = map_spacing_m(poses[:, :2])
     view = MapView(np.array(LIST_SCALE), LIST_RECALL)
     if descriptors is not None:
         view = view_map(descriptors, poses[:, :2], spacing_m)
     centred = poses[:, :2] - poses[:, :2].mean(axis=0)
+    reach = REACH_DELTAS * (StreamConfig().delta_spacings * spacing_m)
     return MapTables(
-        grid=_grid(poses, spacing_m, float(config.delta_spacings) * spacing_m),
+        grid=_grid(poses, spacing_m, reach),
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
         extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),
         scale=jnp.asarray(view.scale, jnp.float32),
