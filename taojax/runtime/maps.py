@@ -120,7 +120,7 @@ def map_tables(
     if descriptors is not None:
         view = view_map(descriptors, poses[:, :2], spacing_m)
     centred = poses[:, :2] - poses[:, :2].mean(axis=0)
-    reach = REACH_DELTAS * (StreamConfig().delta_spacings * spacing_m)
+    reach = REACH_DELTAS * (float(StreamConfig().delta_spacings) * spacing_m)
     return MapTables(
         grid=_grid(poses, spacing_m, reach),
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
