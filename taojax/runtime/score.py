@@ -19,6 +19,7 @@ from taojax.records import code_digest, map_of, refuse_if_taken, write_run
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
+from taojax.runtime.refined import check_refinement
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
 from taojax.runtime.stream import COMPILING, init, replay
@@ -173,6 +174,8 @@ def score(
     command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records)
     notes = list(observations.notes)
+    if config.stream.refine:
+        notes.append(check_refinement(config, records, replayed))
     known_map = {**map_facts(tables), "sha256": observations.sha256}
     if detector is not None and (said := foreign_map(detector, map_of(known_map))):
         notes.append(said)

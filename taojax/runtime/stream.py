@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import Branch, CostParams, branch_cost, huber
+from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
 from taojax.core.sums import least, over_frames
@@ -86,6 +86,21 @@ def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
         delta_m=delta_m,
         mask_m=mask_m,
     )
+
+
+def rank_costs(
+    config: StreamConfig,
+    params: CostParams,
+    p: Float[Array, "n 2"],
+    branches: Branch,
+    weight: Float[Array, " n"],
+) -> BranchCost:
+    """Return Eq. 1 of every rank branch: at the closed form, or at its minimum where asked for."""
+    if not config.refine:
+        return branch_cost(params, p, branches, weight)
+    from taojax.core.refine import refined_costs  # its solver takes up to two seconds to load
+
+    return refined_costs(params, p, branches, weight)
 
 
 def init(config: StreamConfig, tables: MapTables) -> StreamState:
@@ -178,7 +193,8 @@ def step(
     weight = filled / over_frames(filled)
 
     params = cost_params(config, tables)
-    costs = branch_cost(params, p, Branch(jnp.swapaxes(q, 1, 2), s, has_anchor), weight)
+    branches = Branch(jnp.swapaxes(q, 1, 2), s, has_anchor)
+    costs = rank_costs(config, params, p, branches, weight)
     cheapest = least(costs.total)
     # The signal is the minimum over all branches; a pose needs a candidate in the newest frame.
     has_candidates = jnp.any(is_there)

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import Branch, branch_cost
+from taojax.core.cost import Branch
 from taojax.core.se2 import inverse, transform
 from taojax.runtime.frames import Frame
 from taojax.runtime.grid import Row, largest
 from taojax.runtime.maps import MapTables
-from taojax.runtime.stream import Memory, cost_params, init_memory, memory_step
+from taojax.runtime.stream import Memory, cost_params, init_memory, memory_step, rank_costs
 
 MOST_AT_ONCE = 32
 """Units under one `vmap` at most, where vmap is used at all."""
@@ -119,7 +119,7 @@ def rank_signals(tables: MapTables, log: RankLog, unit: RankUnit) -> Float[Array
         weight = seen.astype(jnp.float32)
         cut = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, t, n)
         branches = Branch(cut(log.q), cut(log.similarity), cut(log.has_anchor))
-        costs = branch_cost(params, log.p[t], branches, weight / jnp.sum(weight))
+        costs = rank_costs(unit.config, params, log.p[t], branches, weight / jnp.sum(weight))
         total = costs.geom[None] + costs.vel[None] + unit.gamma[:, None] * costs.sim[None]
         return jnp.min(jnp.where(is_branch, total, jnp.inf), axis=1)
 
@@ -160,7 +160,7 @@ def joint_signals(tables: MapTables, frames: Frame, unit: JointUnit) -> Float[Ar
 def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
     """Group the rank rows of a grid by the fit that they share."""
     groups: dict[tuple[Any, ...], list[int]] = {}
-    names = ("lambda_velocity", "tau_masks", "delta_spacings", "mask_deltas", "window")
+    names = ("lambda_velocity", "tau_masks", "delta_spacings", "mask_deltas", "window", "refine")
     for number, row in enumerate(rows):
         if row["association"] == "rank":
             groups.setdefault(tuple(row[name] for name in names), []).append(number)
@@ -174,7 +174,7 @@ def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
             Unit(
                 tuple(members),
                 RankUnit(
-                    config=_scalars(config, row),
+                    config=_scalars(config, row, refine=bool(row["refine"])),
                     window=jnp.asarray(int(row["window"])),
                     gamma=jnp.asarray(column("gamma_similarity"), jnp.float32),
                     branches=jnp.asarray(column("branches"), jnp.int32),
@@ -261,7 +261,10 @@ def plan(
     if ranked := rank_units(rows, config):
         mine = [row for row in rows if row["association"] == "rank"]
         log = rank_log(tables, frames, largest(mine, "window"), largest(mine, "branches"))
-        work.append((partial(rank_signals, tables, log), ranked))
+        # Refinement is another program: its units stay among themselves.
+        for refine in (False, True):
+            if alike := [unit for unit in ranked if unit.arguments.config.refine == refine]:
+                work.append((partial(rank_signals, tables, log), alike))
     if joint := joint_units(rows, config):
         work.append((partial(joint_signals, tables, frames), joint))
     return work
