@@ -237,9 +237,10 @@ def step(
         "sue": jnp.where(
             has_candidates, signals.sue(anchors, similarity, is_there), tables.extent_m**2
         ),
-        "c_geom": 0.0 - shape.c_geom,
-        "a_aniso": shape.a_aniso,
-        "h_proxy": shape.h_proxy,
+        # Candidates off the map scatter over it and span an area that no driven window does.
+        "c_geom": shape.c_geom,
+        "a_aniso": 0.0 - shape.a_aniso,
+        "h_proxy": 0.0 - shape.h_proxy,
         **terms,
         **rank_terms,
         "support": 1.0 - answer.share,
