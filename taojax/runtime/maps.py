@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from taojax.config import StreamConfig
 from taojax.core.anchors import AnchorGrid
 from taojax.detector import LIST_RECALL
+from taojax.errors import InputError
 from taojax.runtime.scale import LIST_SCALE, MapView, view_map
 
 NEIGHBOURS = 12
@@ -113,8 +114,15 @@ def map_tables(
         config: changes nothing: the tables serve every setting.
         descriptors: `(M, D)` of the map images; they fix the similarity scale and the recall,
             which are 0 to 1 and 0.75 when omitted.
+
+    Raises:
+        InputError: arrays of a wrong shape, or poses that are not finite.
     """
     poses = np.asarray(poses, float)
+    if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses) or not np.isfinite(poses).all():
+        raise InputError(f"poses: expected (M, 3) finite numbers, got {poses.shape}")
+    if descriptors is not None and np.shape(descriptors)[:-1] != (len(poses),):
+        raise InputError(f"descriptors: expected ({len(poses)}, D), got {np.shape(descriptors)}")
     spacing_m = map_spacing_m(poses[:, :2])
     view = MapView(np.array(LIST_SCALE), LIST_RECALL)
     if descriptors is not None:
