@@ -54,7 +54,7 @@ class Recording:
         self.frames = Frame(*(jnp.asarray(a) for a in (odometry, index, similarity)))
 
     def work(self, rows: list[Row]) -> list:
-        return plan(rows, StreamConfig(), self.tables, self.poses, self.frames)
+        return plan(rows, StreamConfig(), self.tables, self.frames)
 
 
 def compare(recording: Recording, say: Callable[[str], None]) -> list[dict[str, object]]:
@@ -89,7 +89,9 @@ def whole(recording: Recording, name: str, grid: Grid, say: Callable[[str], None
     rows, backend = expand(grid, StreamConfig()), jax.default_backend()
     began, cpu, done = time.perf_counter(), time.process_time(), 0
     for signals, units in recording.work(rows):
-        for members, _ in evaluate(signals, units, batch=at_once(units[0], backend)):
+        for members, _ in evaluate(
+            signals, units, batch=at_once(units[0], backend, len(recording.poses))
+        ):
             done += len(members)
     took, cpu = time.perf_counter() - began, time.process_time() - cpu
     frames = len(recording.frames.index)

@@ -48,10 +48,15 @@ class StreamConfig(eqx.Module):
     mask, >= 0: no support is as bad as support at the mask. Its similarity counts as 0."""
 
     delta_spacings: Scalar = 3.0
-    """Huber threshold as a multiple of the map's median spacing, > 0."""
+    """Huber threshold as a multiple of the map's median spacing, > 0. A joint branch finds support
+    within 9 spacings of an anchor, so 6 is the largest that acts in full there."""
 
     mask_deltas: Scalar = 3.0
     """Residual mask as a multiple of the Huber threshold, > 0."""
+
+    refine: bool = eqx.field(static=True, default=False)
+    """*shape*. Take Eq. 1 of rank branches at its true Huber minimum instead of the closed form:
+    `tao_rank` and its terms change, and a frame takes about a millisecond longer."""
 
     joint_window: int = eqx.field(static=True, default=60)
     """*shape*. Frames that a joint branch remembers, at least 3; older ones weigh less anyway."""
@@ -301,5 +306,6 @@ def to_toml(config: Config) -> str:
         for field in dataclasses.fields(module):
             value = getattr(module, field.name)
             text = f'"{value}"' if isinstance(value, str) else repr(value)
+            text = text.lower() if isinstance(value, bool) else text
             lines.append(f"{field.name} = {text}")
     return "\n".join(lines) + "\n"

@@ -30,7 +30,7 @@ GRID = map_tables(PLACES).grid
 SPACING_M = float(map_tables(PLACES).spacing_m)
 start, half_a, half_b = (eqx.filter_jit(f) for f in (find, associate, refit))
 follow = eqx.filter_jit(jax.vmap(joint_branch, in_axes=(None, None, None, 0)))
-pools = eqx.filter_jit(jax.vmap(pool, in_axes=(None, None, None, 0)))
+pools = eqx.filter_jit(jax.vmap(pool, in_axes=(None, None, None, None, 0)))
 
 
 @eqx.filter_jit
@@ -57,7 +57,7 @@ def scene(seed, noise=0.3):
     # Every anchor is listed, in an order that is not the map's.
     listed = jnp.asarray(rng.permutation(M), jnp.int32)
     rows = rows[:, listed]
-    pooled = pools(grid, params.gamma, listed, rows)
+    pooled = pools(grid, params.gamma, params.delta_m, listed, rows)
     window = JointWindow(p, weight, jnp.broadcast_to(listed, (N, M)), rows, pooled)
     seed_pose = truth + jnp.asarray(rng.normal(0, [3, 3, 0.5]), jnp.float32)
     return params, grid, window, truth, seed_pose
@@ -134,8 +134,9 @@ def test_the_order_of_the_window_does_not_matter(rng):
     np.testing.assert_allclose(a.cost, b.cost, rtol=1e-5)
 
 
+@pytest.mark.parametrize("deltas", [0.5, 3.0])
 @pytest.mark.parametrize("n_listed", [3, 20, M])
-def test_pooling_a_list_is_the_argmin_over_every_neighbourhood(n_listed, rng):
+def test_pooling_a_list_is_the_argmin_over_every_neighbourhood(n_listed, deltas, rng):
     index = rng.permutation(M)[:n_listed]
     similarity = rng.uniform(0, 1, n_listed).astype(np.float32)
     index[1], similarity[2] = -1, 0.0
@@ -143,9 +144,11 @@ def test_pooling_a_list_is_the_argmin_over_every_neighbourhood(n_listed, rng):
     row[index] = similarity
     row[-1] = 0.0
     neighbour = np.asarray(GRID.neighbour)
-    best = np.argmin(GRID.neighbour_cost + 1.0 - row[:-1][neighbour], axis=0)
+    r = np.linalg.norm(PLACES[neighbour, :2] - PLACES[None, :, :2], axis=2) / (deltas * SPACING_M)
+    best = np.argmin(np.where(r <= 1, 0.5 * r**2, r - 0.5) + 1.0 - row[:-1][neighbour], axis=0)
     want = neighbour[best, np.arange(M)]
-    place = np.asarray(pool(GRID, 1.0, jnp.asarray(index), jnp.asarray(similarity))).astype(int)
+    place = np.asarray(pool(GRID, 1.0, deltas * SPACING_M, *map(jnp.asarray, (index, similarity))))
+    place = place.astype(int)
     got = np.where(place < n_listed, np.append(index, -1)[place], np.arange(M))
     np.testing.assert_array_equal(got, want)
 

@@ -1,5 +1,7 @@
 """The closed form against SVD, scipy and a plain re-write; laws; degenerate windows."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,8 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from taojax.core import cost as cost_module
+from taojax.core import procrustes
 from taojax.core.cost import Branch, CostParams, branch_cost, huber
 from taojax.core.procrustes import AngleEvidence, diagnose, fit_se2
 from taojax.core.se2 import compose, transform
@@ -245,19 +249,40 @@ def test_gradients_are_finite_everywhere(kind):
         assert np.isfinite(gradient).all()
 
 
-def test_branches_that_trail_cost_the_same_as_one_by_one(rng):
-    p, q = (a.astype(np.float32) for a in window(rng))
-    k = 23
-    qs = jnp.asarray(q[None] + rng.normal(0, 20, (k, N, 2)).astype(np.float32))
-    has = jnp.asarray(rng.random((k, N)) < 0.8)
-    similarity = jnp.asarray(rng.random((k, N)), jnp.float32)
-    weight = jnp.full(N, 1.0 / N)
-    leading = many(params(), jnp.asarray(p), Branch(qs, similarity, has), weight)
-    innermost = Branch(jnp.moveaxis(qs, 0, 1), similarity.T, has.T)
-    got = one(params(), jnp.asarray(p), innermost, weight)
-    np.testing.assert_allclose(got.total, leading.total, rtol=1e-4)
-    np.testing.assert_allclose(got.T_map_odom, leading.T_map_odom, rtol=1e-3, atol=1e-3)
-    np.testing.assert_array_equal(got.is_inlier.T, leading.is_inlier)
+def hypotheses(rng, dtype, k=23):
+    """A window and k branches of it, innermost: anchors far off, some frames without any."""
+    p, q = window(rng)
+    q = q[:, None] + rng.normal(0, rng.uniform(0, 30, (1, k, 1)), (N, k, 2))
+    has = rng.random((N, k)) < rng.uniform(0, 1.2, k)
+    branches = Branch(jnp.asarray(q, dtype), jnp.asarray(rng.random((N, k)), dtype), jnp.array(has))
+    weight = rng.dirichlet(np.ones(N)) * (np.arange(N) > 1)
+    return jnp.asarray(p, dtype), branches, jnp.asarray(weight / weight.sum(), dtype)
+
+
+def both_forms(p, branches, weight):
+    """The same branches by `vmap` over the function of one, and at once, branches innermost."""
+    lifted = jax.vmap(branch_cost, in_axes=(None, None, 1, None))
+    one_by_one = lifted(params(), p, branches, weight)
+    at_once = branch_cost(params(), p, branches, weight)
+    return one_by_one, eqx.tree_at(lambda c: c.is_inlier, at_once, at_once.is_inlier.T)
+
+
+@pytest.mark.parametrize("trial", range(3))
+def test_the_fast_form_is_vmap_over_one_branch_bit_for_bit(trial, rng, monkeypatch):
+    # One operation at a time and sums frame by frame: no compiler orders the roundings anew.
+    for module in (cost_module, procrustes):
+        monkeypatch.setattr(module, "over_frames", lambda x: functools.reduce(jnp.add, x))
+    with jax.disable_jit():
+        one_by_one, at_once = both_forms(*hypotheses(rng, jnp.float32))
+    jax.tree.map(np.testing.assert_array_equal, one_by_one, at_once)
+
+
+@pytest.mark.parametrize("trial", range(3))
+def test_compiled_the_fast_form_is_vmap_over_one_branch_to_the_last_digits(trial, rng):
+    with jax.enable_x64(True):
+        one_by_one, at_once = jax.jit(both_forms)(*hypotheses(rng, jnp.float64))
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+    jax.tree.map(close, one_by_one, at_once)
 
 
 def test_one_hopeless_branch_does_not_disturb_its_neighbours(rng):

@@ -20,7 +20,8 @@ from taojax.runtime.sweep import evaluate, plan
 
 GRID = """
 association = ["rank", "joint"]
-lambda_velocity = [0.0, 1.0]
+lambda_velocity = [1.0]
+refine = [false, true]
 gamma_similarity = [1.0, 50.0]
 delta_spacings = [1.5, 3.0]
 window = [4, 7]
@@ -68,7 +69,7 @@ def swept():
     rows = grids.expand(parsed(GRID), BASE)
     tables = map_tables(poses, BASE)
     found = {}
-    for signals, units in plan(rows, BASE, tables, poses, frames):
+    for signals, units in plan(rows, BASE, tables, frames):
         for members, values in evaluate(signals, units, batch=1):
             found |= dict(zip(members, values, strict=True))
     return rows, poses, frames, np.stack([found[n] for n in range(len(rows))])
@@ -81,7 +82,7 @@ def test_masking_gives_what_a_stream_of_that_size_gives(association, swept):
     sizes = ("window", "branches", "joint_window", "joint_seeds")
     smallest = min(mine, key=lambda n: [rows[n].get(name, 0) for name in sizes])
     # The smallest sizes are masked most; a joint stream takes long to compile.
-    for n in (smallest, mine[-2])[: 2 if association == "rank" else 1]:
+    for n in (smallest, mine[-2], mine[-3])[: 3 if association == "rank" else 1]:
         np.testing.assert_allclose(
             tao[n], streamed(rows[n], poses, frames), rtol=2e-4, atol=2e-5, err_msg=str(rows[n])
         )
@@ -95,7 +96,7 @@ def test_no_two_configurations_give_the_same_signal_by_accident(swept):
 
 def test_vmap_gives_what_the_loop_gives_with_a_last_batch_that_is_not_full(swept):
     rows, poses, frames, tao = swept
-    for signals, units in plan(rows, BASE, map_tables(poses, BASE), poses, frames):
+    for signals, units in plan(rows, BASE, map_tables(poses, BASE), frames):
         part = units[:5]
         found = list(evaluate(signals, part, batch=3))
         assert [r for members, _ in found for r in members] == [r for u in part for r in u.rows]
@@ -105,7 +106,9 @@ def test_vmap_gives_what_the_loop_gives_with_a_last_batch_that_is_not_full(swept
 
 def test_units_share_the_fit_of_gamma_and_branches(swept):
     rows, poses, frames, _ = swept
-    (_, units), _ = plan(rows, BASE, map_tables(poses, BASE), poses, frames)
+    (_, closed), (_, refined), _ = plan(rows, BASE, map_tables(poses, BASE), frames)
+    assert {u.arguments.config.refine for u in refined} == {True}
+    units = [*closed, *refined]
     assert len(units) == 8
     assert sorted(r for u in units for r in u.rows) == list(range(32))
 
@@ -135,6 +138,7 @@ BAD = {
     "delta_spacings = 3": "expected a list",
     "delta_spacings = []": "expected a list",
     "delta_spacings = [true]": "give a list of numbers",
+    "refine = [1]": "give a list of true and false",
     'delta_spacings = ["a"]': "give a list of numbers",
     'association = ["best"]\nwindow = [4]': 'list of "rank" and "joint"',
     'association = ["joint"]\nlambda_velocity = [1]': "no effect on association joint",

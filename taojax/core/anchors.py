@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
+from taojax.core.cost import huber
+
 
 class AnchorGrid(eqx.Module):
     """The static map, prepared for look-ups."""
@@ -36,13 +38,11 @@ class AnchorGrid(eqx.Module):
     neighbour_m2: Float[Array, "b m"]
     """Their squared distances [m^2]."""
 
-    neighbour_cost: Float[Array, "b m"]
-    """rho_delta of their distances over delta^2."""
-
 
 def pool(
     grid: AnchorGrid,
     gamma: float | Float[Array, ""],
+    delta_m: float | Float[Array, ""],
     index: Int[Array, " c"],
     similarity: Float[Array, " c"],
 ) -> UInt[Array, " m"]:
@@ -51,6 +51,7 @@ def pool(
     Args:
         grid: the map.
         gamma: weight of similarity.
+        delta_m: Huber threshold [m].
         index: `(c,)` anchors that the frame's list names, -1 = none.
         similarity: `(c,)` theirs on the fixed scale.
 
@@ -67,7 +68,7 @@ def pool(
     best, least = grid.neighbour[0], jnp.inf
     for b in range(grid.neighbour.shape[0]):
         other = grid.neighbour[b]
-        cost = grid.neighbour_cost[b] + gamma * (1.0 - row[other])
+        cost = huber(grid.neighbour_m2[b], delta_m) / delta_m**2 + gamma * (1.0 - row[other])
         best = jnp.where(cost < least, other, best)
         least = jnp.minimum(cost, least)
     return place[best].astype(np.min_scalar_type(c))

@@ -1,7 +1,13 @@
 """The trajectory-anchor cost of one branch (paper, Eq. 1), term by term.
 
 A branch is one anchor per window frame. Its cost is Eq. 1 at the closed-form alignment; the
-off-map signal of a frame is the minimum over its branches (`vmap` adds them).
+off-map signal of a frame is the minimum over its branches.
+
+The function of one branch is what counts; `jax.vmap(branch_cost, in_axes=(None, None, 1, None))`
+lifts it. The same lines also take the branches at once, behind the time axis: a trailing axis that
+broadcasts. It exists for speed alone. A window of 20 frames and 100 branches takes 40 us so on one
+core, 45 under that `vmap` and 58 with the branches in front, because XLA vectorises over what lies
+innermost, and `vmap` moves it away. A test holds both forms together bit for bit.
 """
 
 from typing import NamedTuple
@@ -199,8 +205,8 @@ def branch_cost(
     Args:
         params: weights and length scales.
         p: `(n, 2)` local trajectory in time order, last pose at the origin, metres.
-        branch: one anchor per frame; the branches trail, where `vmap` would put them in front:
-            with them innermost in memory a CPU takes less than half the time.
+        branch: one anchor per frame; several branches trail the time axis, the fast form of
+            `vmap` over this function.
         weight: `(n,)` weights of the filled window frames, summing to one; 0 for frames that are
             not there yet. Frames without an anchor keep their weight and cost tau + gamma.
 

@@ -7,7 +7,8 @@ it in closed form, again and again, can only lower the cost: iteratively re-weig
 
 No line search, no damping, no linear system: under `vmap` on a CPU it was 1.2 times (hopeless
 branches) to 8 times faster than optimistix's BFGS and 25 to 110 times than its Levenberg-Marquardt,
-at the same optimum. Off by default: `python -m benchmarks refinement` shows what it buys and costs.
+at the same optimum. `StreamConfig(refine=True)` turns it on; a detector hardly gains by it
+(`python -m benchmarks refinement`).
 """
 
 import equinox as eqx
@@ -19,7 +20,9 @@ from jaxtyping import Array, Float, Int
 from taojax.core.cost import (
     MIN_PAIRS,
     Branch,
+    BranchCost,
     CostParams,
+    branch_cost,
     cost_terms,
     squared_residuals,
     step_pairs,
@@ -154,3 +157,37 @@ def refine(
         status=jnp.where(is_finite, status, NOT_FINITE).astype(jnp.int32),
         n_steps=n_steps.astype(jnp.int32),
     )
+
+
+def refined_cost(
+    params: CostParams, p: Float[Array, "n 2"], branch: Branch, weight: Float[Array, " n"]
+) -> BranchCost:
+    """Evaluate Eq. 1 of one branch at its true minimum; `branch_cost` is the start.
+
+    Args:
+        params: weights and length scales.
+        p: `(n, 2)` local trajectory in time order, last pose at the origin, metres.
+        branch: one anchor per frame.
+        weight: `(n,)` weights of the filled window frames, summing to one.
+
+    Returns:
+        As `branch_cost`, its total never above that of the closed form but for rounding.
+    """
+    closed = branch_cost(params, p, branch, weight)
+    pose = refine(params, p, branch, weight, closed.T_map_odom).T_map_odom
+    q = jnp.where(branch.has_anchor[:, None], branch.q, 0.0)
+    is_near = squared_residuals(pose, p, q) <= params.mask_m**2
+    return BranchCost(
+        *cost_terms(params, p, branch, weight, pose),
+        T_map_odom=pose,
+        is_inlier=branch.has_anchor & (weight > 0) & is_near,
+        is_degenerate=closed.is_degenerate,
+    )
+
+
+def refined_costs(
+    params: CostParams, p: Float[Array, "n 2"], branches: Branch, weight: Float[Array, " n"]
+) -> BranchCost:
+    """Evaluate several branches that trail the time axis, as `branch_cost` takes them."""
+    found = jax.vmap(refined_cost, in_axes=(None, None, 1, None))(params, p, branches, weight)
+    return eqx.tree_at(lambda cost: cost.is_inlier, found, found.is_inlier.T)

@@ -4,7 +4,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from taojax.errors import InputError
 
 STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
 WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
@@ -21,6 +24,39 @@ class Frame(eqx.Module):
 
     similarity: Float[Array, "*t c"]
     """Their similarities, at most 1."""
+
+    weight: Float[Array, "*t"] | None = None
+    """The frame's w_i in Eq. 1, >= 0, relative to the others of its window; all alike when left
+    out. NaN and negative ones count as 0. Joint branches weigh frames by their age alone."""
+
+
+def check_frame(frame: Frame, axes: int = 0) -> None:
+    """Refuse a frame that no step can take; shapes and types alone, so traced frames will do.
+
+    Args:
+        frame: one observation, or a log of them.
+        axes: leading axes, 1 for a log.
+
+    Raises:
+        InputError: which array is wrong, what is expected and what was given; one line.
+    """
+    lead, c = "T, " * axes, getattr(frame.similarity, "shape", ())[-1:]
+    start = getattr(frame.odometry, "shape", ())[:axes]
+    wanted = {
+        "odometry": (f"({lead}3)", (3,), jnp.floating),
+        "index": (f"({lead}C)", c, jnp.integer),
+        "similarity": (f"({lead}C)", c, jnp.floating),
+        "weight": (f"({lead.rstrip(' ')})", (), jnp.floating),
+    }
+    for name, (words, shape, kind) in wanted.items():
+        leaf: Any = getattr(frame, name)
+        if leaf is None and name == "weight":
+            continue
+        got = f"{leaf.dtype} {leaf.shape}" if hasattr(leaf, "dtype") else type(leaf).__name__
+        is_right = hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, kind)
+        if not is_right or leaf.shape != (*start, *shape) or len(start) != axes:
+            what = "whole numbers" if kind is jnp.integer else "floats"
+            raise InputError(f"frame.{name}: expected {what} of shape {words}, got {got}")
 
 
 class Signals(eqx.Module, Mapping[str, Array]):

@@ -13,7 +13,7 @@ from taojax.errors import ConfigError
 
 RANK = (
     "lambda_velocity", "gamma_similarity", "tau_masks", "delta_spacings", "mask_deltas", "window",
-    "branches",
+    "branches", "refine",
 )  # fmt: skip
 JOINT = (
     "delta_spacings", "memory_frames", "kappa_spacings", "joint_window", "joint_seeds", "branches",
@@ -23,7 +23,7 @@ SETTINGS = {"rank": RANK, "joint": JOINT}
 
 COLUMNS = tuple(dict.fromkeys(RANK + JOINT))
 
-Grid = Mapping[str, Mapping[str, tuple[float | int, ...]]]
+Grid = Mapping[str, Mapping[str, tuple[float | int | bool, ...]]]
 """Association -> setting -> values; a setting left out keeps the configuration's value."""
 
 Row = dict[str, float | int | str | bool]
@@ -58,6 +58,10 @@ def _value(name: str, value: Any) -> float | int:
     Raises:
         ConfigError: it is no number, or no setting of a stream may hold it.
     """
+    if name == "refine":
+        if not isinstance(value, bool):
+            raise ConfigError(f"refine: {value!r} is not allowed; give a list of true and false")
+        return value
     is_whole = name in ("window", "branches", "joint_window", "joint_seeds")
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):
         kind = "whole numbers" if is_whole else "numbers"
@@ -155,7 +159,7 @@ def to_toml(grid: Grid) -> str:
     lines = []
     for association, values in grid.items():
         lines.append(f"[{association}]")
-        lines += [f"{name} = {list(v)!r}" for name, v in values.items()]
+        lines += [f"{name} = {list(v)!r}".lower() for name, v in values.items()]
     return "\n".join(lines) + "\n"
 
 

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import Branch, branch_cost, huber, squared_residuals
+from taojax.core.cost import Branch, huber, squared_residuals
 from taojax.core.se2 import transform
-from taojax.core.sums import least, over_frames
+from taojax.core.sums import least
 from taojax.runtime.frames import Frame
 from taojax.runtime.joint import follow, joint_step
 from taojax.runtime.maps import MapTables
 from taojax.runtime.scale import rescale
-from taojax.runtime.stream import StreamState, clean, cost_params
+from taojax.runtime.stream import StreamState, clean, cost_params, rank_costs, window_weight
 
 
 class Inside(NamedTuple):
@@ -95,10 +95,9 @@ def rank_inside(
     """
     is_there = clean(config, tables, frame)[1] >= 0
     params = cost_params(config, tables)
-    filled = after.is_filled.astype(jnp.float32)
-    weight = filled / over_frames(filled)
+    weight = window_weight(after.weight, after.is_filled)
     branch = Branch(jnp.swapaxes(after.q, 1, 2), after.similarity, after.has_anchor)
-    costs = branch_cost(params, after.p, branch, weight)
+    costs = rank_costs(config, params, after.p, branch, weight)
     best = least(jnp.where(is_there | ~jnp.any(is_there), costs.total, jnp.inf))
     pose, has = costs.T_map_odom[best], after.has_anchor[:, best]
     q = after.q[:, :, best]

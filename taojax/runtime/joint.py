@@ -146,7 +146,9 @@ def follow(
     p = transform(inverse(odometry)[None], state.p).at[slot].set(0.0)
     listed = state.listed.at[slot].set(index)
     similarity = state.similarity.at[slot].set(scaled)
-    pooled = state.pooled.at[slot].set(pool(tables.grid, GAMMA, index, scaled))
+    params = joint_params(config, tables)
+    best_near = pool(tables.grid, params.gamma, params.delta_m, index, scaled)
+    pooled = state.pooled.at[slot].set(best_near)
     is_filled = state.is_filled.at[slot].set(True)
     age = jnp.mod(slot - jnp.arange(n), n)
     decay = jnp.where(is_filled, jnp.exp(-age.astype(p.dtype) / config.memory_frames), 0.0)
@@ -159,7 +161,7 @@ def follow(
     # Without any candidate and history the first anchor is as good a guess as any.
     is_live = jnp.concatenate([is_seed, is_seed, jnp.repeat(state.has_carried, 2)])
     branches = jax.vmap(joint_branch, in_axes=(None, None, None, 0))(
-        joint_params(config, tables), tables.grid, window, seeds
+        params, tables.grid, window, seeds
     )
     is_live = is_live | ~jnp.any(is_live)
     return Followed(window, is_filled, age, branches, is_live, jnp.any(is_seed))

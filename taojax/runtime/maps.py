@@ -10,16 +10,26 @@ from taojax.config import StreamConfig
 from taojax.core.anchors import AnchorGrid
 from taojax.core.belief import Places
 from taojax.detector import LIST_RECALL
+from taojax.errors import InputError
 from taojax.runtime.scale import LIST_SCALE, MapView, correlation_gaps, view_map
 
 NEIGHBOURS = 12
 """Anchors pooled around each anchor."""
 
 REACH_DELTAS = 3.0
-"""A grid cell knows an anchor within so many Huber thresholds."""
+"""A grid cell knows an anchor within so many Huber thresholds, the default ones: the tables depend
+on no setting, so that every setting may be swept under `vmap`. Support ends at 1.5 thresholds, so
+up to twice the default nothing is cut off; beyond, support ends at this reach."""
 
 ON_EDGES = 0.1
 """Share of anchors that one corner must serve better than the other to be preferred."""
+
+PLACES_REACH = 4.0
+"""A cell of the filter's grid knows an anchor within so many gaps: twice as far as a transition
+may come from."""
+
+IN_ORDER = 3.0
+"""Rows whose median step is longer than so many gaps are in no driving order."""
 
 MOST_UNIT = 4.0
 """A whole piece of evidence takes at most so many gaps of way, however slowly the map changes."""
@@ -55,17 +65,19 @@ def map_spacing_m(xy: np.ndarray) -> float:
     """Return the median step between consecutive map positions while the robot was moving.
 
     Args:
-        xy: `(M, 2)` metres, driving order.
+        xy: `(M, 2)` metres; in any order, but only driving order tells steps from gaps.
 
     Returns:
         Metres; steps below a quarter of the 90 % quantile are standstill and do not count.
-        1 where the map never moves.
+        1 where the map never moves. Where the rows are in no driving order, `gap_m`.
     """
     steps = np.hypot(*np.diff(np.asarray(xy, float), axis=0).T)
     steps = steps[steps > 1e-6]
     if not steps.size:
         return 1.0
-    return float(np.median(steps[steps >= 0.25 * np.quantile(steps, 0.9)]))
+    step = float(np.median(steps[steps >= 0.25 * np.quantile(steps, 0.9)]))
+    gap = gap_m(xy)
+    return step if step <= IN_ORDER * gap else gap
 
 
 def gap_m(xy: np.ndarray) -> float:
@@ -85,7 +97,7 @@ def gap_m(xy: np.ndarray) -> float:
     return float(np.median(nearest[nearest >= 0.25 * np.quantile(nearest, 0.9)]))
 
 
-def _grid(poses: np.ndarray, spacing_m: float, delta_m: float, reach: float) -> AnchorGrid:
+def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
     xy = poses[:, :2]
     tree = KDTree(xy)
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
@@ -98,7 +110,6 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float, reach: float) -> 
     n_neighbours = min(NEIGHBOURS, len(xy))
     gap, neighbour = tree.query(xy, k=n_neighbours)
     gap, neighbour = gap.reshape(len(xy), -1).T, neighbour.reshape(len(xy), -1).T
-    r = gap / delta_m
     return AnchorGrid(
         xy=jnp.asarray(xy, jnp.float32),
         theta=jnp.asarray(poses[:, 2], jnp.float32),
@@ -109,7 +120,6 @@ def _grid(poses: np.ndarray, spacing_m: float, delta_m: float, reach: float) -> 
         cell_m=jnp.asarray(cell_m, jnp.float32),
         neighbour=jnp.asarray(neighbour, jnp.int32),
         neighbour_m2=jnp.asarray(gap**2, jnp.float32),
-        neighbour_cost=jnp.asarray(np.where(r <= 1, 0.5 * r**2, r - 0.5), jnp.float32),
     )
 
 
@@ -134,25 +144,31 @@ def map_tables(
 
     Args:
         poses: `(M, 3)` x [m], y [m], theta [rad] of every map image, driving order.
-        config: sets the Huber threshold in map spacings; defaults when omitted.
+        config: changes nothing: the tables serve every setting.
         descriptors: `(M, D)` of the map images; they fix the similarity scale and the recall,
             which are 0 to 1 and 0.75 when omitted.
+
+    Raises:
+        InputError: arrays of a wrong shape, or poses that are not finite.
     """
-    config = StreamConfig() if config is None else config
     poses = np.asarray(poses, float)
+    if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses) or not np.isfinite(poses).all():
+        raise InputError(f"poses: expected (M, 3) finite numbers, got {poses.shape}")
+    if descriptors is not None and np.shape(descriptors)[:-1] != (len(poses),):
+        raise InputError(f"descriptors: expected ({len(poses)}, D), got {np.shape(descriptors)}")
     spacing_m = map_spacing_m(poses[:, :2])
     view = MapView(np.array(LIST_SCALE), LIST_RECALL)
     if descriptors is not None:
         view = view_map(descriptors, poses[:, :2], spacing_m)
     centred = poses[:, :2] - poses[:, :2].mean(axis=0)
-    delta_m, step_m = float(config.delta_spacings) * spacing_m, gap_m(poses[:, :2])
-    unit = 1.0
+    reach = REACH_DELTAS * (float(StreamConfig().delta_spacings) * spacing_m)
+    step_m, unit = gap_m(poses[:, :2]), 1.0
     if descriptors is not None:
         unit = float(np.clip(correlation_gaps(descriptors, poses[:, :2], step_m), 1.0, MOST_UNIT))
     return MapTables(
-        grid=_grid(poses, spacing_m, delta_m, REACH_DELTAS * delta_m),
+        grid=_grid(poses, spacing_m, reach),
         places=Places(
-            grid=_grid(poses, 0.5 * step_m, delta_m, 4.0 * step_m),
+            grid=_grid(poses, 0.5 * step_m, PLACES_REACH * step_m),
             gap_m=jnp.asarray(step_m, jnp.float32),
             unit_m=jnp.asarray(unit * step_m, jnp.float32),
         ),

@@ -21,6 +21,7 @@ from taojax.runtime import hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
+from taojax.runtime.refined import check_refinement
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
 from taojax.runtime.stream import COMPILING, init, replay
@@ -180,6 +181,8 @@ def score(
     table = signal_table(observations.t_s, records) | hindsight.now_columns(both.now)
     delayed = hindsight.delayed_columns(tables, both)
     notes = list(observations.notes)
+    if config.stream.refine:
+        notes.append(check_refinement(config, records, replayed))
     known_map = {**map_facts(tables), "sha256": observations.sha256}
     used = for_run(calibration or shipped(), config.audit.max_wrong, config.verdict.lag)
     if said := foreign_map(used.fitted_on, map_of(known_map)):

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import Branch, CostParams, branch_cost, huber
+from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
 from taojax.core.sums import least, over_frames
+from taojax.errors import InputError
 from taojax.runtime import signals
 from taojax.runtime.answer import joint_answer, joint_terms, rank_answer
 from taojax.runtime.frames import (
@@ -27,6 +28,7 @@ from taojax.runtime.frames import (
     Frame,
     Signals,
     StreamRecord,
+    check_frame,
 )
 from taojax.runtime.joint import JointReading, JointState, init_joint, joint_step
 from taojax.runtime.maps import MapTables
@@ -65,6 +67,9 @@ class StreamState(eqx.Module):
     is_filled: Bool[Array, " n"]
     """False for frames before the start."""
 
+    weight: Float[Array, " n"]
+    """w_i of Eq. 1 as given, 0 before the start."""
+
     top1: Float[Array, " h"]
     """Past top-1 signals, oldest first."""
 
@@ -88,6 +93,21 @@ def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
     )
 
 
+def rank_costs(
+    config: StreamConfig,
+    params: CostParams,
+    p: Float[Array, "n 2"],
+    branches: Branch,
+    weight: Float[Array, " n"],
+) -> BranchCost:
+    """Return Eq. 1 of every rank branch: at the closed form, or at its minimum where asked for."""
+    if not config.refine:
+        return branch_cost(params, p, branches, weight)
+    from taojax.core.refine import refined_costs  # its solver takes up to two seconds to load
+
+    return refined_costs(params, p, branches, weight)
+
+
 def init(config: StreamConfig, tables: MapTables) -> StreamState:
     """Return the state before the first frame on this map."""
     n, k = config.window, config.branches
@@ -97,6 +117,7 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
         similarity=jnp.zeros((n, k)),
         has_anchor=jnp.zeros((n, k), bool),
         is_filled=jnp.zeros(n, bool),
+        weight=jnp.zeros(n),
         top1=jnp.zeros(max(signals.WINDOWS)),
         n_seen=jnp.zeros((), jnp.int32),
         memory=None if config.association == "rank" else init_memory(config, tables),
@@ -128,6 +149,34 @@ def memory_step(
 
 def _push(window: Array, newest: Array) -> Array:
     return jnp.concatenate([window[1:], newest[None]])
+
+
+def _own_weight(frame: Frame, like: Array) -> Array:
+    if frame.weight is None:
+        return jnp.ones((), like.dtype)
+    is_good = jnp.isfinite(frame.weight) & (frame.weight > 0)
+    return jnp.where(is_good, frame.weight, 0.0).astype(like.dtype)
+
+
+def window_weight(given: Float[Array, " n"], is_filled: Bool[Array, " n"]) -> Float[Array, " n"]:
+    """Return the weights of a window, summing to one; all alike where none weighs anything."""
+    filled = is_filled.astype(given.dtype)
+    own = jnp.where(over_frames(given) > 0, given, filled)
+    return own / over_frames(own)
+
+
+def check_state(config: StreamConfig, tables: MapTables, state: StreamState) -> None:
+    """Refuse a state of other settings or of another map.
+
+    Raises:
+        InputError: it does not have the shapes that `init` gives.
+    """
+    want = jax.eval_shape(init, config, tables)
+    shapes = lambda tree: [leaf.shape for leaf in jax.tree.leaves(tree)]
+    if jax.tree.structure(state) != jax.tree.structure(want) or shapes(state) != shapes(want):
+        raise InputError(
+            "state: of other settings or another map; make it with init(config, tables)"
+        )
 
 
 def clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array, Array, Array]:
@@ -165,8 +214,11 @@ def step(
         is in `status`.
 
     Raises:
-        Nothing. Inputs are checked once, at the door, by `load_observations`.
+        InputError: arrays of a wrong shape or type, before the first frame is computed. Values are
+            checked once, at the door, by `load_observations`.
     """
+    check_frame(frame)
+    check_state(config, tables, state)
     odometry, index, similarity = clean(config, tables, frame)
     is_there = index >= 0
     anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
@@ -174,11 +226,12 @@ def step(
     q, s = _push(state.q, anchors.T), _push(state.similarity, similarity)
     has_anchor = _push(state.has_anchor, is_there)
     is_filled = _push(state.is_filled, jnp.ones((), bool))
-    filled = is_filled.astype(p.dtype)
-    weight = filled / over_frames(filled)
+    given = _push(state.weight, _own_weight(frame, p))
+    weight = window_weight(given, is_filled)
 
     params = cost_params(config, tables)
-    costs = branch_cost(params, p, Branch(jnp.swapaxes(q, 1, 2), s, has_anchor), weight)
+    branches = Branch(jnp.swapaxes(q, 1, 2), s, has_anchor)
+    costs = rank_costs(config, params, p, branches, weight)
     cheapest = least(costs.total)
     # The signal is the minimum over all branches; a pose needs a candidate in the newest frame.
     has_candidates = jnp.any(is_there)
@@ -221,9 +274,10 @@ def step(
         "sue": jnp.where(
             has_candidates, signals.sue(anchors, similarity, is_there), tables.extent_m**2
         ),
-        "c_geom": 0.0 - shape.c_geom,
-        "a_aniso": shape.a_aniso,
-        "h_proxy": shape.h_proxy,
+        # Candidates off the map scatter over it and span an area that no driven window does.
+        "c_geom": shape.c_geom,
+        "a_aniso": 0.0 - shape.a_aniso,
+        "h_proxy": 0.0 - shape.h_proxy,
         **terms,
         **rank_terms,
         "support": 1.0 - answer.share,
@@ -249,6 +303,7 @@ def step(
         similarity=s,
         has_anchor=has_anchor,
         is_filled=is_filled,
+        weight=given,
         top1=history,
         n_seen=n_seen,
         memory=memory,
@@ -270,6 +325,10 @@ def replay(
 
     Returns:
         The final state and one record per frame, the same as from single steps.
+
+    Raises:
+        InputError: arrays of a wrong shape or type.
     """
+    check_frame(frames, axes=1)
     start = init(config, tables) if state is None else state
     return jax.lax.scan(lambda carry, frame: step(config, tables, carry, frame), start, frames)

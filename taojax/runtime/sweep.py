@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
-from taojax.core.cost import Branch, branch_cost
+from taojax.core.cost import Branch
 from taojax.core.se2 import inverse, transform
 from taojax.runtime.frames import Frame
 from taojax.runtime.grid import Row, largest
-from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.stream import Memory, cost_params, init_memory, memory_step
+from taojax.runtime.maps import MapTables
+from taojax.runtime.stream import Memory, cost_params, init_memory, memory_step, rank_costs
 
 MOST_AT_ONCE = 32
 """Units under one `vmap` at most, where vmap is used at all."""
@@ -58,7 +58,6 @@ class JointUnit(eqx.Module):
     """One joint configuration."""
 
     config: StreamConfig
-    tables: MapTables
     window: Int[Array, "*u"]
     seeds: Int[Array, "*u"]
     branches: Int[Array, "*u"]
@@ -120,22 +119,23 @@ def rank_signals(tables: MapTables, log: RankLog, unit: RankUnit) -> Float[Array
         weight = seen.astype(jnp.float32)
         cut = lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, t, n)
         branches = Branch(cut(log.q), cut(log.similarity), cut(log.has_anchor))
-        costs = branch_cost(params, log.p[t], branches, weight / jnp.sum(weight))
+        costs = rank_costs(unit.config, params, log.p[t], branches, weight / jnp.sum(weight))
         total = costs.geom[None] + costs.vel[None] + unit.gamma[:, None] * costs.sim[None]
         return jnp.min(jnp.where(is_branch, total, jnp.inf), axis=1)
 
     return jax.lax.map(at, jnp.arange(log.p.shape[0])).T
 
 
-def joint_signals(frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
+def joint_signals(tables: MapTables, frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
     """Return the signal of a stream with joint branches.
 
     Args:
+        tables: the map.
         frames: checked at the door.
         unit: `config` holds the sizes of the arrays. Its lists are longer than the recording's by
             the number of seeds, because a candidate that may not seed moves behind those that may.
     """
-    config, tables = unit.config, unit.tables
+    config = unit.config
     n, n_seeds, c = config.joint_window, config.joint_seeds, frames.index.shape[1]
     place = jnp.arange(config.branches)
     source = jnp.where(place < unit.seeds, place, place - (n_seeds - unit.seeds))
@@ -160,7 +160,7 @@ def joint_signals(frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
 def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
     """Group the rank rows of a grid by the fit that they share."""
     groups: dict[tuple[Any, ...], list[int]] = {}
-    names = ("lambda_velocity", "tau_masks", "delta_spacings", "mask_deltas", "window")
+    names = ("lambda_velocity", "tau_masks", "delta_spacings", "mask_deltas", "window", "refine")
     for number, row in enumerate(rows):
         if row["association"] == "rank":
             groups.setdefault(tuple(row[name] for name in names), []).append(number)
@@ -174,7 +174,7 @@ def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
             Unit(
                 tuple(members),
                 RankUnit(
-                    config=_scalars(config, row),
+                    config=_scalars(config, row, refine=bool(row["refine"])),
                     window=jnp.asarray(int(row["window"])),
                     gamma=jnp.asarray(column("gamma_similarity"), jnp.float32),
                     branches=jnp.asarray(column("branches"), jnp.int32),
@@ -184,37 +184,12 @@ def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
     return units
 
 
-def delta_tables(
-    tables: MapTables, poses: np.ndarray, config: StreamConfig, deltas: Sequence[float]
-) -> dict[float, MapTables]:
-    """Return the map's tables for each Huber threshold, in arrays of one size."""
-    made = {
-        delta: map_tables(poses, dataclasses.replace(config, delta_spacings=delta)).grid
-        for delta in deltas
-    }
-    cells = max((len(grid.nearest) for grid in made.values()), default=0)
-    return {
-        # A look-up stays inside the grid's own shape, so that what is added is never read.
-        delta: eqx.tree_at(
-            lambda t: t.grid,
-            tables,
-            eqx.tree_at(lambda g: g.nearest, grid, jnp.pad(
-                grid.nearest, (0, cells - len(grid.nearest)), constant_values=-1)),
-        )
-        for delta, grid in made.items()
-    }  # fmt: skip
-
-
-def joint_units(
-    rows: Sequence[Row], config: StreamConfig, tables: MapTables, poses: np.ndarray
-) -> list[Unit]:
+def joint_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
     """Return one unit per joint row of a grid."""
     mine = {n: row for n, row in enumerate(rows) if row["association"] == "joint"}
     if not mine:
         return []
     chosen = list(mine.values())
-    deltas = dict.fromkeys(float(row["delta_spacings"]) for row in chosen)
-    of_delta = delta_tables(tables, poses, config, list(deltas))
     seeds = largest(chosen, "joint_seeds")
     sizes = {
         "joint_window": largest(chosen, "joint_window"),
@@ -224,7 +199,6 @@ def joint_units(
     return [
         Unit((number,), JointUnit(
             config=_scalars(config, row, **sizes),
-            tables=of_delta[float(row["delta_spacings"])],
             window=jnp.asarray(int(row["joint_window"])),
             seeds=jnp.asarray(int(row["joint_seeds"])),
             branches=jnp.asarray(int(row["branches"])),
@@ -233,7 +207,7 @@ def joint_units(
     ]  # fmt: skip
 
 
-def at_once(unit: Unit, backend: str) -> int:
+def at_once(unit: Unit, backend: str, n_anchors: int) -> int:
     """Return how many units go under one `vmap`; 1 means a loop.
 
     On a CPU the loop wins: `python -m benchmarks sweep_speed` found vmap to take twice the CPU
@@ -244,7 +218,7 @@ def at_once(unit: Unit, backend: str) -> int:
         return 1
     n_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(unit.arguments))
     if isinstance(unit.arguments, JointUnit):
-        n_bytes += unit.arguments.config.joint_window * len(unit.arguments.tables.grid.xy)
+        n_bytes += unit.arguments.config.joint_window * n_anchors
     return max(1, min(MOST_AT_ONCE, MEMORY_BYTES // n_bytes))
 
 
@@ -280,14 +254,17 @@ def evaluate(
 
 
 def plan(
-    rows: Sequence[Row], config: StreamConfig, tables: MapTables, poses: np.ndarray, frames: Frame
+    rows: Sequence[Row], config: StreamConfig, tables: MapTables, frames: Frame
 ) -> list[tuple[Callable[[Any], Array], list[Unit]]]:
     """Return what to compute: per association a function of one unit, and its units."""
     work: list[tuple[Callable[[Any], Array], list[Unit]]] = []
     if ranked := rank_units(rows, config):
         mine = [row for row in rows if row["association"] == "rank"]
         log = rank_log(tables, frames, largest(mine, "window"), largest(mine, "branches"))
-        work.append((partial(rank_signals, tables, log), ranked))
-    if joint := joint_units(rows, config, tables, poses):
-        work.append((partial(joint_signals, frames), joint))
+        # Refinement is another program: its units stay among themselves.
+        for refine in (False, True):
+            if alike := [unit for unit in ranked if unit.arguments.config.refine == refine]:
+                work.append((partial(rank_signals, tables, log), alike))
+    if joint := joint_units(rows, config):
+        work.append((partial(joint_signals, tables, frames), joint))
     return work

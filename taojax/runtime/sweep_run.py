@@ -159,9 +159,9 @@ def sweep(
         total=len(rows), initial=len(done), unit="configuration", disable=not progress, leave=False
     )
     with bar:
-        for signals, units in plan(rows, config.stream, tables, poses, frames):
+        for signals, units in plan(rows, config.stream, tables, frames):
             left = [unit for unit in units if not done.issuperset(unit.rows)]
-            batch = at_once(units[0], jax.default_backend())
+            batch = at_once(units[0], jax.default_backend(), len(poses))
             for members, found in evaluate(signals, left, batch=batch):
                 tao[list(members)] = found
                 part = _as_npz({"row": np.array(members), "tao": found, "key": np.array(mark)})
