@@ -159,9 +159,11 @@ def draw(rows: Sequence[Row]) -> Figure:
     for height, cells in enumerate(reversed(found.values())):
         ax.plot([cells[ORACLE]] * 2, [height - 0.32, height + 0.32], color=PALE, linewidth=3,
                 label="oracle" if height == 0 else None)  # fmt: skip
-        for colour, (method, marker) in zip(CYCLE, MARKS.items(), strict=False):
+        for number, (method, marker) in enumerate(MARKS.items()):
             label = TITLES[method] if height == 0 else None
-            ax.plot(cells[method], height, marker, color=colour, markersize=6, label=label)
+            # Side by side, for equal shares would hide one another.
+            at = height + 0.13 * (len(MARKS) // 2 - number)
+            ax.plot(cells[method], at, marker, color=CYCLE[number], markersize=5, label=label)
     ax.set_yticks(range(len(found)), list(found)[::-1], fontsize=8)
     ax.set(xlim=(-0.02, 1.02), ylim=(-0.7, len(found) - 0.3))
     ax.set_xlabel("share of the test frames farther than r_out from the truth, after optimising")

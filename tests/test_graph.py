@@ -25,7 +25,8 @@ needs_gtsam = pytest.mark.skipif(
     not HAS_GTSAM, reason="GTSAM is not installed: python -m pip install 'taojax[graph]'"
 )
 
-FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
+"""Rank compiles in a fraction of the time; what is tested does not depend on it."""
 SPACING_M = 2.0
 AREA_M2 = 1e4
 TIGHT = np.diag([0.5, 0.5, 0.05]) ** 2

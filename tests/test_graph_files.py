@@ -21,7 +21,8 @@ HAS_GTSAM = importlib.util.find_spec("gtsam") is not None
 needs_gtsam = pytest.mark.skipif(
     not HAS_GTSAM, reason="GTSAM is not installed: python -m pip install 'taojax[graph]'"
 )
-FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
+FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
+"""Rank compiles in a fraction of the time; what is tested does not depend on it."""
 
 
 def block(start):
