@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 
-from taojax.errors import GateError, TaojaxError, UsageError
+from taojax.errors import GateError, MissingExtraError, TaojaxError, UsageError
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where real recordings lie when `--data` does not say: beside the checkout."""
@@ -34,6 +34,11 @@ def _parser() -> argparse.ArgumentParser:
     progress.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     gallery = verbs.add_parser("gallery", help="the README's sheet of figures")
     gallery.add_argument("--out", type=Path, help="folder to make (default runs/gallery/TIME)")
+    graph = verbs.add_parser("graph", help="what closures do to a pose graph; needs gtsam")
+    graph.add_argument("--quick", action="store_true", help="fewer worlds")
+    graph.add_argument("--out", type=Path, help="folder to make (default runs/graph/TIME)")
+    graph.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
+    graph.add_argument("--only", default="", help="only data sets whose name contains this")
     verbs.add_parser("notebooks", help="executes the notebooks and keeps their figures")
     refinement = verbs.add_parser("refinement", help="what the true Huber minimum buys and costs")
     refinement.add_argument("--quick", action="store_true", help="500 windows instead of 10,000")
@@ -57,11 +62,22 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _reliability(out: Path, *, quick: bool, only: str) -> int:
+def _graph(out: Path, args: argparse.Namespace) -> int:
+    from benchmarks import graph
+
+    try:
+        graph.run(out, args.data, quick=args.quick, only=args.only)
+    except TaojaxError as error:
+        print(error, file=sys.stderr)
+        return 4 if isinstance(error, MissingExtraError) else 3
+    return 0
+
+
+def _reliability(out: Path, args: argparse.Namespace) -> int:
     from benchmarks import reliability
 
     try:
-        return 1 if reliability.run(out, quick=quick, only=only) else 0
+        return 1 if reliability.run(out, quick=args.quick, only=args.only) else 0
     except UsageError as error:
         print(error, file=sys.stderr)
         return 2
@@ -105,8 +121,8 @@ def main(arguments: list[str] | None = None) -> int:
         except TaojaxError as error:
             print(error, file=sys.stderr)
             return 5 if isinstance(error, GateError) else 3
-    elif args.verb == "reliability":
-        return _reliability(out, quick=args.quick, only=args.only)
+    elif args.verb in ("reliability", "graph"):
+        return {"reliability": _reliability, "graph": _graph}[args.verb](out, args)
     else:
         from benchmarks import quality
 

@@ -27,6 +27,7 @@ from taojax.verbs import (
     evaluate,
     explain,
     export,
+    graph,
     inspect,
     kidnap,
     rerun,
@@ -50,6 +51,7 @@ Verb = (
     | sweep.Sweep
     | export.Export
     | closures.Closures
+    | graph.Graph
     | explain.Explain
     | watch.Watch
     | compare.Compare
@@ -68,6 +70,7 @@ RUN = {
     sweep.Sweep: sweep.run,
     export.Export: export.run,
     closures.Closures: closures.run,
+    graph.Graph: graph.run,
     explain.Explain: explain.run,
     watch.Watch: watch.run,
     compare.Compare: compare.run,

@@ -20,7 +20,18 @@ from taojax.risk import from_toml as read_calibration
 from taojax.specs import fail, read_text
 from taojax.tables import MOTION, POSE, read_frames, read_table, stacked
 
-__all__ = ["Graph", "Verdicts", "build_graph", "g2o_text", "read_verdicts", "tum_text"]
+__all__ = [
+    "Graph",
+    "Verdicts",
+    "between",
+    "build_graph",
+    "compose",
+    "g2o_text",
+    "in_axes_of",
+    "read_verdicts",
+    "tum_text",
+    "wrap",
+]
 
 MAP_STIFFNESS = 1000.0
 """Edges between neighbouring map poses are so many times tighter than a closure: the map stays."""
@@ -85,11 +96,14 @@ class Graph(NamedTuple):
 
     map_index: Int[np.ndarray, " t"]
     verdict: Shaped[np.ndarray, " t"]
+    covariance: Float[np.ndarray, "t 3 3"]
+    """Of the answered pose: x [m], y [m], theta [rad] in the map frame."""
+
     sigma_m: float
-    """Standard deviation of a closure's position: the Huber threshold of this map."""
+    """Standard deviation of a position where nothing better is known: the Huber threshold."""
 
     sigma_rad: float
-    """Of its angle: the Huber threshold over the length of a window."""
+    """Of an angle: the Huber threshold over the length of a window."""
 
     spacing_m: float
 
@@ -150,23 +164,29 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
     )
 
 
-def _wrap(angle: np.ndarray | float) -> np.ndarray:
+def wrap(angle: np.ndarray | float) -> np.ndarray:
+    """Return angles in (-pi, pi] [rad]."""
     return np.asarray(np.arctan2(np.sin(angle), np.cos(angle)))
 
 
-def _compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return pose `b`, given in axes of `a`, in the frame of `a`; float64."""
+def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return pose `b`, given in axes of `a`, in the frame of `a`.
+
+    Args:
+        a: (..., 3) x [m], y [m], theta [rad], float64.
+        b: likewise.
+    """
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x, y = b[..., 0], b[..., 1]
-    theta = _wrap(a[..., 2] + b[..., 2])
+    theta = wrap(a[..., 2] + b[..., 2])
     return np.stack([a[..., 0] + c * x - s * y, a[..., 1] + s * x + c * y, theta], axis=-1)
 
 
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return pose `b` in axes of `a`."""
+def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return pose `b` in axes of `a`; both (..., 3) x [m], y [m], theta [rad]."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x, y = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([c * x + s * y, c * y - s * x, _wrap(b[..., 2] - a[..., 2])], axis=-1)
+    return np.stack([c * x + s * y, c * y - s * x, wrap(b[..., 2] - a[..., 2])], axis=-1)
 
 
 def _chained(odometry: np.ndarray, known: np.ndarray, is_start: np.ndarray) -> np.ndarray:
@@ -183,10 +203,10 @@ def _chained(odometry: np.ndarray, known: np.ndarray, is_start: np.ndarray) -> n
         anchor = int(inside[0]) if inside.size else int(first)
         out[anchor] = known[anchor] if inside.size else 0.0
         for t in range(anchor, first, -1):
-            still = _between(odometry[t], np.zeros(3))
-            out[t - 1] = _compose(out[t], still)
+            still = between(odometry[t], np.zeros(3))
+            out[t - 1] = compose(out[t], still)
         for t in range(anchor + 1, end):
-            out[t] = known[t] if has[t] else _compose(out[t - 1], odometry[t])
+            out[t] = known[t] if has[t] else compose(out[t - 1], odometry[t])
     return out
 
 
@@ -214,6 +234,8 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
     settings: StreamConfig = from_toml(folder / "config.toml").stream
     spacing_m = float(facts["map_spacing_m"])
     delta = float(settings.delta_spacings)
+    sigma_m, sigma_rad = delta * spacing_m, delta / settings.window
+    same = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
     return Graph(
         map_pose=stacked(poses, POSE),
         query_pose=_chained(odometry, np.where(is_accepted[:, None], pose, np.nan), is_start),
@@ -223,8 +245,9 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
         pose=pose,
         map_index=verdicts.map_index,
         verdict=verdicts.verdict,
-        sigma_m=delta * spacing_m,
-        sigma_rad=delta / settings.window,
+        covariance=np.broadcast_to(same, (n, 3, 3)),
+        sigma_m=sigma_m,
+        sigma_rad=sigma_rad,
         spacing_m=spacing_m,
     )
 
@@ -237,13 +260,32 @@ def _lines(tag: str, *columns: np.ndarray) -> list[str]:
     ]
 
 
-def _edges(
-    a: np.ndarray, b: np.ndarray, motion: np.ndarray, sigma_m: np.ndarray | float, sigma_rad: float
-) -> list[str]:
-    position = 1.0 / np.broadcast_to(sigma_m, len(a)) ** 2
-    zero = np.zeros(len(a))
-    angle = zero + 1.0 / sigma_rad**2
-    return _lines("EDGE_SE2", a, b, motion, position, zero, zero, position, zero, angle)
+def _edges(a: np.ndarray, b: np.ndarray, motion: np.ndarray, covariance: np.ndarray) -> list[str]:
+    information = np.linalg.inv(covariance)
+    upper = information[:, *np.triu_indices(3)]
+    return _lines("EDGE_SE2", a, b, motion, upper)
+
+
+def _diagonal(n: int, sigma_m: np.ndarray | float, sigma_rad: float) -> np.ndarray:
+    """Return n covariances (n, 3, 3) of one angle and of one or n positions."""
+    out = np.zeros((n, 3, 3))
+    out[:, 0, 0] = out[:, 1, 1] = np.broadcast_to(sigma_m, n) ** 2
+    out[:, 2, 2] = sigma_rad**2
+    return out
+
+
+def in_axes_of(
+    pose: Float[np.ndarray, "*b 3"], covariance: Float[np.ndarray, "*b 3 3"]
+) -> Float[np.ndarray, "*b 3 3"]:
+    """Turn covariances of x, y, theta from the map frame into the axes of their own poses.
+
+    g2o and GTSAM measure the error of an edge there.
+    """
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    turn = np.zeros((*pose.shape, 3))
+    turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = c, s, -s, c
+    turn[..., 2, 2] = 1.0
+    return turn @ covariance @ np.swapaxes(turn, -1, -2)
 
 
 def g2o_text(graph: Graph, verdict: str) -> str:
@@ -254,11 +296,11 @@ def g2o_text(graph: Graph, verdict: str) -> str:
         verdict: accept, or reject for a graph to compare with; never optimise that one.
 
     Returns:
-        A g2o file. Information matrices are diagonal: 1 / delta^2 for the position of a closure,
-        where delta is the Huber threshold (3 map spacings), and (window / delta_spacings)^2 for its
-        angle; the map's own edges are `MAP_STIFFNESS` times tighter in standard deviation; an
-        odometry edge takes 10 % of its length, at least 1 % of the spacing, and `ODOMETRY_RAD`.
-        Put your own covariance there if you have one.
+        A g2o file. The information matrix of a closure is the inverse of the covariance that it
+        carries, turned into the axes of its pose; the map's own edges are `MAP_STIFFNESS` times
+        tighter than the Huber threshold (3 map spacings) in standard deviation; an odometry edge
+        takes 10 % of its length, at least 1 % of the spacing, and `ODOMETRY_RAD`. Put your own
+        covariance there if you have one.
     """
     n_map, n_query = len(graph.map_pose), len(graph.query_pose)
     rows, after = graph.rows(verdict), np.flatnonzero(~graph.is_start)
@@ -269,15 +311,16 @@ def g2o_text(graph: Graph, verdict: str) -> str:
         *_lines("VERTEX_SE2", m, graph.map_pose),
         *_lines("VERTEX_SE2", n_map + np.arange(n_query), graph.query_pose),
         *_edges(
-            m[:-1], m[1:], _between(graph.map_pose[:-1], graph.map_pose[1:]),
-            graph.sigma_m / MAP_STIFFNESS, graph.sigma_rad / MAP_STIFFNESS,
+            m[:-1], m[1:], between(graph.map_pose[:-1], graph.map_pose[1:]),
+            _diagonal(n_map - 1, graph.sigma_m / MAP_STIFFNESS, graph.sigma_rad / MAP_STIFFNESS),
         ),
         *_edges(
-            n_map + after - 1, n_map + after, graph.odometry[after], slack, ODOMETRY_RAD
+            n_map + after - 1, n_map + after, graph.odometry[after],
+            _diagonal(len(after), slack, ODOMETRY_RAD),
         ),
         *_edges(
-            place, n_map + rows, _between(graph.map_pose[place], graph.pose[rows]),
-            graph.sigma_m, graph.sigma_rad,
+            place, n_map + rows, between(graph.map_pose[place], graph.pose[rows]),
+            in_axes_of(graph.pose[rows], graph.covariance[rows]),
         ),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"

@@ -277,3 +277,37 @@ def scenario_dots(
     ax.grid(alpha=0.25, axis="y")
     _legend_above(ax, columns=5)
     return ax
+
+
+def graph_map(
+    map_m: Float[np.ndarray, "m 2"],
+    truth_m: Float[np.ndarray, "t 2"],
+    path_m: Float[np.ndarray, "t 2"],
+    wrong: Float[np.ndarray, "w 2 2"],
+    *,
+    ax: Axes,
+) -> Axes:
+    """Draw an optimised trajectory on the map, and the wrong closures that pulled at it.
+
+    Args:
+        map_m: map positions, metres; map and truth set the limits.
+        truth_m: true positions, metres.
+        path_m: optimised positions, metres.
+        wrong: true and answered position of each wrong closure, metres.
+        ax: where to draw.
+    """
+    ax.scatter(*map_m.T, s=2, color="#c8c8c8", linewidths=0, label="map", zorder=1)
+    # Many lines together must not hide what lies below.
+    alpha = float(np.clip(40.0 / max(1, len(wrong)), 0.12, 0.6))
+    for line in wrong:
+        ax.plot(*line.T, color=MAP_OUT, linewidth=0.5, alpha=alpha, zorder=2)
+    if len(wrong):
+        label = "wrong closure, from the true place to the answer"
+        ax.plot([], [], color=MAP_OUT, linewidth=1.0, label=label)
+    ax.plot(*truth_m.T, color=INK, linewidth=0.9, linestyle=":", label="truth", zorder=3)
+    ax.plot(*path_m.T, color=IN_MAP, linewidth=1.1, label="optimised", zorder=4)
+    low, high = _map_limits(map_m, truth_m)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    ax.set_aspect("equal", adjustable="box")
+    ax.tick_params(labelsize=6)
+    return ax

@@ -17,7 +17,7 @@ VERBS = (
     "audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export", "convert",
     "inspect",
     "compare", "doctor", "rerun",
-    "closures", "explain", "watch",
+    "closures", "explain", "graph", "watch",
 )  # fmt: skip
 
 

@@ -115,7 +115,7 @@ def test_a_closure_leads_from_its_map_pose_to_the_answered_pose(run):
         np.testing.assert_allclose(vertices[b], want, atol=1e-6)
         delta = 3.0 * sealed.manifest["map_spacing_m"]
         want = np.diag([1 / delta**2, 1 / delta**2, (6 / 3.0) ** 2])
-        np.testing.assert_allclose(information, want, rtol=1e-6)
+        np.testing.assert_allclose(information, want, rtol=1e-6, atol=1e-9)
 
 
 def test_the_maps_own_edges_keep_it_as_it_is(run):
@@ -168,6 +168,7 @@ def graph(n=6, **changes):
         "pose": np.tile([5.0, 6.0, 0.5], (n, 1)),
         "map_index": np.ones(n, int),
         "verdict": np.array(["accept"] * n, dtype=object),
+        "covariance": np.tile(np.diag([9.0, 9.0, 0.01]), (n, 1, 1)),
         "sigma_m": 3.0,
         "sigma_rad": 0.1,
         "spacing_m": 1.0,
@@ -193,6 +194,16 @@ def test_between_accepted_frames_odometry_carries_on_and_each_trial_starts_alone
     driven = [line.split()[1:3] for line in lines.splitlines() if line.startswith("EDGE")][2:8]
     assert ["6", "7"] not in driven
     assert len(driven) == 6
+
+
+def test_the_covariance_of_a_closure_is_written_in_the_axes_of_its_pose(tmp_path):
+    covariance = np.array([[4.0, 1.0, 0.1], [1.0, 2.0, 0.2], [0.1, 0.2, 0.3]])
+    made = graph(covariance=np.tile(covariance, (6, 1, 1)))
+    (tmp_path / "closures.g2o").write_text(closures.g2o_text(made, "accept"))
+    *_, information = read_g2o(tmp_path / "closures.g2o")[1][-1]
+    turn = np.eye(3)
+    turn[:2, :2] = matrix(made.pose[0])[:2, :2].T
+    np.testing.assert_allclose(np.linalg.inv(information), turn @ covariance @ turn.T, rtol=1e-6)
 
 
 def test_a_frame_without_pose_closes_nothing():

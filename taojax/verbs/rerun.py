@@ -100,7 +100,7 @@ def _read(run: Path) -> "Run":
     return read_run(run)
 
 
-def _places(run: Path, named: str) -> Iterator[Path]:
+def data_places(run: Path, named: str) -> Iterator[Path]:
     """Yield where the data may lie: as named, beside the run, and where `audit` puts its own."""
     yield Path(named)
     yield run.resolve().parent / named
@@ -109,7 +109,7 @@ def _places(run: Path, named: str) -> Iterator[Path]:
 
 
 def _find(run: Path, named: str) -> Path:
-    for place in _places(run, named):
+    for place in data_places(run, named):
         if named and (place / "map/poses.csv").is_file():
             return place
     what = f"its data are not at {named!r} any more" if named else "does not say where its data lie"
