@@ -235,7 +235,10 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
     spacing_m = float(facts["map_spacing_m"])
     delta = float(settings.delta_spacings)
     sigma_m, sigma_rad = delta * spacing_m, delta / settings.window
-    same = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
+    covariance = np.zeros((n, 3, 3))
+    for name, row, column in (("var_x_m2", 0, 0), ("var_y_m2", 1, 1), ("cov_xy_m2", 0, 1)):
+        covariance[:, row, column] = covariance[:, column, row] = run.delayed[name]
+    covariance[:, 2, 2] = sigma_rad**2
     return Graph(
         map_pose=stacked(poses, POSE),
         query_pose=_chained(odometry, np.where(is_accepted[:, None], pose, np.nan), is_start),
@@ -245,7 +248,7 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
         pose=pose,
         map_index=verdicts.map_index,
         verdict=verdicts.verdict,
-        covariance=np.broadcast_to(same, (n, 3, 3)),
+        covariance=covariance,
         sigma_m=sigma_m,
         sigma_rad=sigma_rad,
         spacing_m=spacing_m,

@@ -128,8 +128,10 @@ def test_a_follower_forgets_what_no_window_reaches(tables, rng):
 def test_an_answer_looks_no_farther_ahead_than_its_lag(name, tables, rng):
     parts, t = LOGS[name](rng), 24
     before, other = replayed(CONFIG, tables, parts), log(np.random.default_rng(1))
-    changed = [np.concatenate([mine[: t + 1], theirs[T - t - 2 : 0 : -1]])[:T]
-               for mine, theirs in zip(parts, other, strict=True)]  # fmt: skip
+    changed = [
+        np.concatenate([mine[: t + 1], theirs[1 : T - t]])
+        for mine, theirs in zip(parts, other, strict=True)
+    ]
     after = replayed(CONFIG, tables, changed)
     assert_same(before.now, after.now, slice(0, t + 1))
     assert not np.array_equal(before.now.features[t + 1 :], after.now.features[t + 1 :])

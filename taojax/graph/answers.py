@@ -1,6 +1,5 @@
 """Which closures each method hands to the back-end, from what a run answered and decided."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +9,6 @@ from jaxtyping import Bool, Float
 from taojax.closures import build_graph, read_verdicts
 from taojax.errors import InputError
 from taojax.records import Run
-from taojax.tables import POSE, read_frames, stacked
 
 __all__ = ["Answers", "Closure", "Run2D", "Stream", "read_answers"]
 
@@ -79,11 +77,6 @@ class Run2D(NamedTuple):
     """Median distance between neighbouring map poses."""
 
 
-def _named(table: Mapping[str, np.ndarray], suffix: str) -> np.ndarray:
-    """Return the pose columns with a suffix before the unit, such as x_now_m."""
-    return stacked(table, [name.replace("_", f"{suffix}_", 1) for name in POSE])
-
-
 def _raw(run: Run, map_pose: np.ndarray, sigma_m: float) -> tuple[Stream, np.ndarray]:
     """Return the first candidates as answers, and their similarity."""
     index = run.index[:, 0].astype(int)
@@ -98,9 +91,6 @@ def _raw(run: Run, map_pose: np.ndarray, sigma_m: float) -> tuple[Stream, np.nda
 
 def read_answers(folder: Path, run: Run) -> Run2D:
     """Read what a run answered and decided. The only place that knows the columns of its files.
-
-    Where verdicts.csv has poses of its own, they are the answers; older ones decide about the poses
-    of signals.csv, and their probability of being off the map stands for that of being wrong.
 
     Args:
         folder: the run.
@@ -118,17 +108,10 @@ def read_answers(folder: Path, run: Run) -> Run2D:
     graph = build_graph(folder, run, verdicts)
     top1, similarity = _raw(run, graph.map_pose, graph.sigma_m)
     final = Stream(verdicts.verdict == "accept", graph.pose, graph.covariance, verdicts.probability)
-    now = final
-    if verdicts.source == "verdicts.csv":
-        table = read_frames(folder / "verdicts.csv", "verdicts", len(final.accepted))
-        if "verdict_now" in table:
-            final = final._replace(
-                pose=_named(table, ""), probability_wrong=table["probability_wrong"]
-            )
-            now = Stream(
-                table["verdict_now"] == "accept", _named(table, "_now"), graph.covariance,
-                table["probability_wrong_now"],
-            )  # fmt: skip
+    now = Stream(
+        verdicts.verdict_now == "accept", verdicts.pose_now, graph.covariance,
+        verdicts.probability_now,
+    )  # fmt: skip
     return Run2D(
         answers=Answers(final, now, top1, similarity),
         odometry=graph.odometry,
