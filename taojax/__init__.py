@@ -8,7 +8,7 @@ judge.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from taojax.config import Config, StreamConfig

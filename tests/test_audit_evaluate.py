@@ -13,13 +13,15 @@ from taojax.audit.evaluate import evaluate
 from taojax.audit.report import write_summary
 from taojax.audit.tables import to_latex, to_markdown
 from taojax.errors import InputError
+from taojax.risk import from_toml
 from taojax.tables import read_table
 
 FILES = {
     "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "calibration.toml", "report.html",
-    "tables/main.md", "tables/main.tex",
+    "tables/main.md", "tables/main.tex", "tables/risk_coverage.csv",
     *(f"tables/{n}.{e}"
-      for n in ("metrics", "recall", "micro", "errors", "conformal", "counts", "rates")
+      for n in ("metrics", "recall", "micro", "errors", "conformal", "counts", "rates",
+                "verdicts")
       for e in ("csv", "md", "tex")),
     *(f"figures/{n}.{e}"
       for n in ("map", "diagnostics", "roc", "pr", "reliability", "retrieval", "micro")
@@ -56,12 +58,14 @@ def test_every_table_meets_its_spec(case):
     run = case[0]
     paths = {"labels": "labels.csv", "verdicts": "verdicts.csv", "metrics": "metrics.csv"}
     paths |= {name: f"tables/{name}.csv" for name in ("recall", "micro", "errors")}
+    paths |= {"verdict_table": "tables/verdicts.csv", "risk_coverage": "tables/risk_coverage.csv"}
     tables = {name: read_table(run / path, name) for name, path in paths.items()}
     lengths = {name: len(next(iter(table.values()))) for name, table in tables.items()}
     n_signals = len(records.signal_names())
     assert lengths == {
-        "labels": 240, "verdicts": 240, "metrics": n_signals + 1, "recall": 3,
-        "micro": 2 * n_signals, "errors": 4,
+        "labels": 240, "verdicts": 240, "metrics": n_signals + 3, "recall": 3,
+        "micro": 2 * n_signals, "errors": 4, "verdict_table": 2,
+        "risk_coverage": 100 * (n_signals + 3),
     }  # fmt: skip
 
 
@@ -115,8 +119,63 @@ def test_verdicts_cover_every_frame_and_warming_up_abstains(case):
     table = read_table(case[0] / "verdicts.csv", "verdicts")
     assert table["verdict"][:2].tolist() == ["abstain", "abstain"]
     assert set(table["verdict"][2:]) == {"accept", "reject", "abstain"}
-    kinds = {reason.split(":")[0] for reason in table["reason"][table["verdict"] == "abstain"]}
-    assert kinds <= {"warming_up", "stale", "lost"}
+    for end in ("", "_now"):
+        left = table[f"reason{end}"][table[f"verdict{end}"] == "abstain"]
+        assert {reason.split(":")[0] for reason in left[:2]} == {"warming_up"}
+        assert all("neither sure enough to accept" in reason for reason in left[2:])
+        p = table[f"probability_wrong{end}"]
+        assert p[table[f"verdict{end}"] == "accept"].max() < p[2:][
+            table[f"verdict{end}"][2:] == "abstain"
+        ].min()
+
+
+def test_the_answers_are_scored_by_right_and_wrong(case):
+    table = read_table(case[0] / "metrics.csv", "metrics")
+    rows = {str(row[0]): dict(zip(table, row, strict=True)) for row in
+            zip(*table.values(), strict=True)}  # fmt: skip
+    for name in ("probability_wrong_now", "probability_wrong", "tao", "fused"):
+        for column in ("aurc", "recall_at_p95", "recall_at_p99"):
+            assert 0 <= rows[name][column] <= 1, (name, column)
+    assert rows["probability_wrong"]["aurc"] < rows["margin"]["aurc"]
+    assert rows["probability_wrong"]["recall_at_p95"] > rows["margin"]["recall_at_p95"]
+
+
+def test_the_table_of_verdicts_counts_what_verdicts_and_truth_say(case):
+    run, _, _, done = case
+    table, verdicts = (
+        read_table(run / path, spec)
+        for path, spec in (("tables/verdicts.csv", "verdict_table"), ("verdicts.csv", "verdicts"))
+    )
+    judgement = done.judgement
+    test = judgement.splits.test.frame
+    for row, end in (("now", "_now"), ("final", "")):
+        at = list(table["verdict"]).index(row)
+        error = np.hypot(
+            verdicts[f"x{end}_m"] - judgement.query_m[:, 0],
+            verdicts[f"y{end}_m"] - judgement.query_m[:, 1],
+        )[test]
+        accepted = verdicts[f"verdict{end}"][test] == "accept"
+        near = judgement.nearest_m[test] <= 10.0
+        assert table["wrong"][at] == (accepted & (error > 10.0)).sum()
+        assert table["right"][at] == (accepted & (error <= 10.0) & near).sum()
+        assert table["accepted"][at] == table["right"][at] + table["wrong"][at]
+        assert table["max_wrong"][at] == 0.05
+        assert table["promise"][at]
+    frozen = from_toml(run / "calibration.toml")
+    assert frozen.final.promise.replace(",", ";") == table["promise"][1]
+    assert frozen.map_out is not None
+
+
+def test_a_smaller_share_of_wrong_answers_accepts_no_more(case, tmp_path, no_figures):
+    run, truth, _, done = case
+    strict = evaluate(run, truth, judged.config(max_wrong=0.01), out=tmp_path / "strict")
+    many = lambda found: (found.judgement.verdicts["verdict"] == "accept").sum()
+    assert many(strict) < many(done)
+    none = evaluate(run, truth, judged.config(max_wrong=0.001), out=tmp_path / "none")
+    assert many(none) == 0
+    assert none.sentences[0].startswith("Of the test answers none is accepted, of ")
+    assert "no closure of this recording should enter a graph" in none.sentences[0]
+    assert "nothing is accepted: " in none.sentences[0]
 
 
 def test_the_micro_audit_has_no_grey_zone(case):
@@ -166,11 +225,12 @@ def test_the_report_prints_seal_note_and_every_sentence(case):
 
 def test_the_sentences_say_how_many_were_accepted_and_the_false_acceptance_rate(case):
     text = " ".join(case[3].sentences)
-    assert re.search(
-        r"accepted \d+, \d+ at the right place and \d+ at a wrong place( \(\d+ % of them "
-        r"wrong\))?, rejected \d+ and abstained on \d+",
+    assert re.match(
+        r"Of \d+ accepted test answers \d+ are right: wrong share [\d.]+ \(.*?\)\. Of \d+ right "
+        r"test answers \d+ are accepted: recall [\d.]+ \(.*?\)\. Promised: at most 5% of",
         text,
     )
+    assert re.search(r"taojax accepted \d+, rejected \d+ and abstained on \d+\.", text)
     assert "False acceptance rate" in text
 
 
@@ -196,25 +256,26 @@ def test_a_data_set_with_one_class_gets_recall_and_a_plain_sentence(tmp_path):
     assert not (run / "figures/roc.csv").exists()
 
 
-def test_a_calibration_split_off_the_map_gives_blanks_and_abstentions(tmp_path, no_figures):
+def test_a_calibration_split_off_the_map_has_no_threshold_and_accepts_nothing(
+    tmp_path, no_figures
+):
     run, truth = judged.seal(tmp_path, n=120)
     done = evaluate(run, truth, judged.config(r_in_m=1e-6, r_out_m=1e-5))
-    assert set(done.judgement.verdicts["verdict"]) == {"abstain"}
     table = read_table(run / "metrics.csv", "metrics")
-    assert np.isnan(table["threshold"]).all()
+    answered = np.char.startswith(table["signal"].astype(str), "probability_wrong")
+    assert np.isnan(table["threshold"][~answered]).all()
     assert "no threshold" in " ".join(done.sentences)
+    # Every answer of the calibration half is wrong: none is like one that was right.
+    assert "accept" not in done.judgement.verdicts["verdict"]
 
 
-def test_a_run_too_short_for_a_test_split_is_reported_not_crashed(tmp_path):
-    run, truth = judged.seal(tmp_path, n=12)
+@pytest.mark.parametrize("status", ["no_candidates", "warming_up"])
+def test_a_run_without_an_answer_abstains_throughout(status, tmp_path, no_figures):
+    run, truth = judged.seal(tmp_path, n=120, status=status)
     done = evaluate(run, truth, judged.config())
-    assert "too short" in done.sentences[0]
-
-
-def test_a_run_that_is_lost_throughout_abstains(tmp_path, no_figures):
-    run, truth = judged.seal(tmp_path, n=120, status="lost")
-    done = evaluate(run, truth, judged.config())
-    assert set(done.judgement.verdicts["verdict"]) == {"abstain"}
+    for name in ("verdict", "verdict_now"):
+        assert set(done.judgement.verdicts[name]) == {"abstain"}
+    assert np.isnan(done.judgement.verdicts["x_m"]).all()
     assert done.judgement.errors["n"][0] == 0
 
 

@@ -313,30 +313,26 @@ def test_the_small_world_has_verdicts_of_every_kind(plain):
     assert counts.min() > 5
 
 
-WORLDS = {"shuffled": shuffled, "turned": turned, "mirrored": mirrored, "larger": larger}
+# Share of changed verdicts, and gaps by which nine final answers in ten move at most. Rows only
+# change order and metres only their name; a turned or mirrored map lies otherwise on its grid of
+# half a gap, so that other anchors are the nearest ones.
+WORLDS = {
+    "shuffled": (shuffled, 0.0, 1e-3),
+    "larger": (larger, 0.01, 0.05),
+    "turned": (turned, 0.03, 1.5),
+    "mirrored": (mirrored, 0.03, 1.5),
+}
 
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_other_coordinates_change_nearly_nothing(name, drive, plain):
-    tables, both, verdicts, p = drive.answered(**WORLDS[name](drive))
-    gap = float(plain[0].places.gap_m)
-    scale = 10.0 if name == "larger" else 1.0
+    changed, share, gaps = WORLDS[name]
+    tables, both, verdicts, p = drive.answered(**changed(drive))
+    before, scale = plain[0].places, 10.0 if name == "larger" else 1.0
+    gap = float(before.gap_m)
     assert float(tables.places.gap_m) == pytest.approx(scale * gap, rel=1e-4)
-    assert float(tables.places.unit_m) == pytest.approx(
-        scale * float(plain[0].places.unit_m), rel=1e-3
-    )
+    assert float(tables.places.unit_m) == pytest.approx(scale * float(before.unit_m), rel=1e-3)
+    assert (verdicts != plain[2]).mean() <= share
     apart = np.hypot(*(unmoved(drive, name, both.final.pose) - plain[1].final.pose[:, :2]).T) / gap
-    off = np.abs(both.final.features - plain[1].final.features)
-    print(
-        name,
-        "verdicts",
-        (verdicts != plain[2]).mean(axis=1),
-        "p",
-        np.quantile(np.abs(p - plain[3]), [0.5, 0.9, 0.99, 1]),
-        "pose",
-        np.quantile(apart, [0.5, 0.9, 0.99, 1]),
-        "feat med",
-        np.median(off, axis=0).max(),
-        dict(zip(hindsight.FEATURES, off.max(axis=0).round(3))),
-    )
-    assert (verdicts != plain[2]).mean() <= 0.01
+    assert np.quantile(apart, 0.9) <= gaps
+    assert np.median(np.abs(p - plain[3])) <= 0.01

@@ -20,16 +20,8 @@ LEFT_OUT, LEFT_IN = "abstained off the map", "abstained in the map"
 def _kinds(judgement: Judgement) -> dict[str, Bool[np.ndarray, " t"]]:
     """Return what can become of a test frame; each is of one kind."""
     verdict = judgement.verdicts["verdict"]
-    level = judgement.detector.threshold
-    is_above = judgement.verdicts["probability_map_out"] > level
-    left = verdict == "abstain"
-    kinds = {"accepted": verdict == "accept", "rejected": verdict == "reject"}
-    if np.isnan(level):
-        return kinds | {"abstained": left}
-    return kinds | {
-        "abstained at or below the threshold": left & ~is_above,
-        "abstained above the threshold": left & is_above,
-    }
+    names = {"accept": "accepted", "reject": "rejected", "abstain": "abstained"}
+    return {done: verdict == name for name, done in names.items()}
 
 
 def counts_table(judgement: Judgement) -> Table:
@@ -74,8 +66,7 @@ def _counted(judgement: Judgement) -> list[tuple[str, str, str, Bool[np.ndarray,
     ]
     if np.isnan(judgement.detector.threshold):
         return rates
-    low = "accepted + abstained at or below the threshold"
-    high = "rejected + abstained above the threshold"
+    low, high = "probability_map_out at or below the threshold", "probability_map_out above it"
     alone = [(THRESHOLD_FAR, low, far, ~is_above), (THRESHOLD_FRR, high, frr, is_above)]
     return [*rates, *alone]
 

@@ -14,7 +14,15 @@ from taojax.audit.glossary import about, glossary, names_of_signals, names_of_ta
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.page import Cell, Grid, Page, grid, render
 from taojax.audit.route import route_json
-from taojax.audit.words import MAIN, lead_words, metric_row, rate, span, warnings
+from taojax.audit.words import (
+    MAIN,
+    accepted_row,
+    lead_words,
+    metric_row,
+    rate,
+    span,
+    warnings,
+)
 from taojax.specs import read_npz, write_atomically
 
 _ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")
@@ -42,7 +50,15 @@ def _cards(judgement: Judgement) -> list[Cell]:
     test, rates = judgement.splits.test.frame, rates_of(judgement)
     tao = metric_row(judgement, "tao")
     verdict = judgement.verdicts["verdict"][test]
-    cards = [
+    row = accepted_row(judgement, "final")
+    n, right, total = (int(row[name]) for name in ("accepted", "right", "right_total"))
+    shares = (
+        (_big(row["wrong_share"]), f"wrong among accepted: {n - right} of {n}", "wrong share"),
+        (_big(row["recall"]), f"right ones accepted: {right} of {total}", "recall"),
+        (f"{row['max_wrong']:g}", f"wrong at most, promised: {row['promise']}", "accepted"),
+    )
+    cards = [Cell(big, small, glossary()[word]) for big, small, word in shares]
+    cards += [
         Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", glossary()[said])
         for word, said in (("accept", "accepted"), ("reject", "rejected"), ("abstain", "abstained"))
     ]

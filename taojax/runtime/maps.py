@@ -168,7 +168,7 @@ def map_tables(
     return MapTables(
         grid=_grid(poses, spacing_m, reach),
         places=Places(
-            grid=_grid(poses, 0.5 * step_m, PLACES_REACH * step_m),
+            grid=_grid(poses, step_m, PLACES_REACH * step_m),
             gap_m=jnp.asarray(step_m, jnp.float32),
             unit_m=jnp.asarray(unit * step_m, jnp.float32),
         ),
