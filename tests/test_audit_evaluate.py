@@ -124,9 +124,10 @@ def test_verdicts_cover_every_frame_and_warming_up_abstains(case):
         assert {reason.split(":")[0] for reason in left[:2]} == {"warming_up"}
         assert all("neither sure enough to accept" in reason for reason in left[2:])
         p = table[f"probability_wrong{end}"]
-        assert p[table[f"verdict{end}"] == "accept"].max() < p[2:][
-            table[f"verdict{end}"][2:] == "abstain"
-        ].min()
+        assert (
+            p[table[f"verdict{end}"] == "accept"].max()
+            < p[2:][table[f"verdict{end}"][2:] == "abstain"].min()
+        )
 
 
 def test_the_answers_are_scored_by_right_and_wrong(case):
@@ -256,9 +257,7 @@ def test_a_data_set_with_one_class_gets_recall_and_a_plain_sentence(tmp_path):
     assert not (run / "figures/roc.csv").exists()
 
 
-def test_a_calibration_split_off_the_map_has_no_threshold_and_accepts_nothing(
-    tmp_path, no_figures
-):
+def test_a_calibration_split_off_the_map_has_no_threshold_and_accepts_nothing(tmp_path, no_figures):
     run, truth = judged.seal(tmp_path, n=120)
     done = evaluate(run, truth, judged.config(r_in_m=1e-6, r_out_m=1e-5))
     table = read_table(run / "metrics.csv", "metrics")

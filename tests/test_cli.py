@@ -10,6 +10,7 @@ import pytest
 
 from taojax.cli import main
 from taojax.records import signal_names
+from taojax.specs import column_names
 
 FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
 """Rank compiles in a fraction of the time; what is tested does not depend on it."""
@@ -62,11 +63,19 @@ def test_score_seals_a_run_with_every_column(data_folder, tmp_path):
         "odometry.csv",
         "retrievals.npz",
         "signals.csv",
+        "delayed.csv",
+        "decisions.csv",
+        "detector.toml",
     }
     lines = (out / "signals.csv").read_text().splitlines()
     header = ["frame", "t_s", "status", "map_index", "x_m", "y_m", "theta_rad", *signal_names()]
-    assert lines[0].split(",") == header
+    assert lines[0].split(",")[: len(header)] == header
+    assert all(name.startswith("now_") for name in lines[0].split(",")[len(header) :])
     assert len(lines) == 51
+    for name, spec in (("signals", "signals"), ("delayed", "delayed"), ("decisions", "verdicts")):
+        rows = (out / f"{name}.csv").read_text().splitlines()
+        assert tuple(rows[0].split(",")) == column_names(spec)
+        assert len(rows) == 51
     with np.load(out / "retrievals.npz") as arrays:
         assert arrays["index"].shape == arrays["similarity"].shape == (50, 100)
 
@@ -133,8 +142,9 @@ def test_a_calibration_file_carries_the_verdicts_to_run_time(data_folder, tmp_pa
     )
     assert first is not None
     assert int(first[1]) + int(first[2]) == n_accepted
+    # The judge, who knows this place, is now asked first.
     assert main(["closures", str(scored)]) == 0
-    assert f"of the {n_accepted} accepted of all frames" in capfd.readouterr().out
+    assert "verdicts of verdicts.csv on 50 frames" in capfd.readouterr().out
     raw = bytearray((scored / "decisions.csv").read_bytes())
     raw[-3] ^= 1
     (scored / "decisions.csv").write_bytes(raw)

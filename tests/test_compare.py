@@ -256,6 +256,13 @@ def _edit(path, old, new, count=1):
     path.write_text(body.replace(old, new, count))
 
 
+def edited_probability(run):
+    head, *rows = (run / "verdicts.csv").read_text().splitlines()
+    assert head.endswith(",probability_map_out")
+    rows = [row.rpartition(",")[0] + f",{t % 7 / 7}" for t, row in enumerate(rows)]
+    (run / "verdicts.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
 def other_truth(run):
     path = run / "audit.json"
     facts = json.loads(path.read_text()) | {"truth_sha256": "0" * 64}
@@ -291,10 +298,7 @@ SPOILT = {
         lambda run: (run / "signals.csv").write_text("frame\n0\n"),
         "signals.csv: seal broken",
     ),
-    "edited probability": (
-        lambda run: _edit(run / "verdicts.csv", "accept,0.", "accept,0.9", 200),
-        "auroc_test of fused",
-    ),
+    "edited probability": (edited_probability, "auroc_test of fused"),
     "short labels": (
         lambda run: (run / "labels.csv").write_text(
             "\n".join((run / "labels.csv").read_text().splitlines()[:-3]) + "\n"

@@ -88,7 +88,7 @@ def test_every_number_has_a_definition_and_the_command_that_made_it(case):
     page = _Seen()
     page.feed((run / "report.html").read_text())
     tables = [title for title in page.heads if "made by" in title]
-    assert len(page.cards) == 6
+    assert len(page.cards) == 9
     assert len(tables) > 40
     for title in (*page.cards, *tables):
         meaning, _, command = title.partition(" — made by: ")

@@ -150,7 +150,9 @@ def _run_grids(judgement: Judgement) -> list[Grid]:
 def _terms() -> dict[str, Mapping[str, str]]:
     """Return the definitions of all names in tables, figures and the frame panel, by section."""
     tables_here = ("counts", "rates", "errors", "recall", "metrics", "conformal", "micro")
-    return {"Signals": names_of_signals(), "Columns of the tables": names_of_tables(tables_here)}
+    # Reasons name the features of answers.
+    named = names_of_tables((*tables_here, "delayed"))
+    return {"Signals": names_of_signals(), "Columns of the tables": named}
 
 
 def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
