@@ -11,8 +11,9 @@ from conftest import loop, write_folder
 from taojax.cli import main
 from taojax.errors import InputError
 from taojax.runtime import inspection
-from taojax.runtime.likeness import chance, histogram, places, views
+from taojax.runtime.likeness import chance, histogram, views
 from taojax.runtime.observations import load_observations
+from taojax.verbs.inspect_truth import places, scale_of
 
 ODOMETRY = "t_s,dx_m,dy_m,dtheta_rad"
 MAP, QUERY, TRUTH = "map/poses.csv", "query/odometry.csv", "truth/query_poses.csv"
@@ -373,11 +374,10 @@ def test_the_scale_of_odometry_survives_a_jump():
     moved = np.c_[np.full(100, 1.1), np.zeros((100, 2))]
     moved[0] = 99.0
     moved[30, 0] = 500.0
-    got = inspection.steps(moved, true)
-    assert got.scale == pytest.approx(1.1)
+    assert scale_of(moved, true) == pytest.approx(1.1)
+    got = inspection.steps(moved)
     assert (got.largest_m, got.largest_row) == (500.0, 30)
-    assert inspection.steps(moved, None).scale is None
-    assert inspection.steps(np.zeros((5, 3)), np.zeros((5, 2))).scale is None
+    assert scale_of(np.zeros((5, 3)), np.zeros((5, 2))) is None
 
 
 def test_norms_are_measured_in_blocks_of_any_kind():

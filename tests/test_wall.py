@@ -1,7 +1,9 @@
 """The wall between robot and judge: six layers, and the planted cheats that each must catch."""
 
+import ast
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -271,6 +273,17 @@ def test_two_runs_of_one_data_set_have_the_same_bytes(rng, tmp_path):
     score(folder, tmp_path / "b", SMALL)
     for name in (*records.SEALED, "manifest.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_nothing_on_the_robots_side_takes_the_truth():
+    names = {
+        f"{path.relative_to(ROOT)}: {arg.arg}"
+        for room in ("core", "runtime", "baselines")
+        for path in sorted((ROOT / "taojax" / room).glob("*.py"))
+        for arg in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(arg, ast.arg) and re.match("(true|truth)(_|$)", arg.arg)
+    }
+    assert not names
 
 
 def test_jaxtyping_is_on():

@@ -49,9 +49,9 @@ def check_frame(frame: Frame, axes: int = 0) -> None:
         "weight": (f"({lead.rstrip(' ')})", (), jnp.floating),
     }
     for name, (words, shape, kind) in wanted.items():
-        leaf: Any = getattr(frame, name)
-        if leaf is None and name == "weight":
+        if name == "weight" and frame.weight is None:
             continue
+        leaf: Any = getattr(frame, name)
         got = f"{leaf.dtype} {leaf.shape}" if hasattr(leaf, "dtype") else type(leaf).__name__
         is_right = hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, kind)
         if not is_right or leaf.shape != (*start, *shape) or len(start) != axes:

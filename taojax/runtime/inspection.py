@@ -1,7 +1,6 @@
 """Measures of a data folder before anything is scored: clocks, drives and lengths of descriptors.
 
-Pure functions of arrays; what they mean is said elsewhere. Where a measure takes true positions,
-its caller has read them.
+Pure functions of arrays; what they mean is said elsewhere.
 """
 
 from dataclasses import dataclass
@@ -241,24 +240,16 @@ class Steps:
     """Share of the motion that is not along the body axis."""
 
     largest_yaw_rad: float
-    scale: float | None
-    """Odometry over truth: median over the steps that truly move; None without truth."""
 
 
-def steps(odometry: Float[np.ndarray, "t 3"], true_xy: Float[np.ndarray, "t 2"] | None) -> Steps:
+def steps(odometry: Float[np.ndarray, "t 3"]) -> Steps:
     """Measure odometry.
 
     Args:
         odometry: (T, 3) forward [m], left [m], yaw [rad]; row 0 is ignored.
-        true_xy: (T, 2) true positions [m], where known.
     """
     moved = odometry[1:]
     length = np.hypot(moved[:, 0], moved[:, 1])
-    scale = None
-    if true_xy is not None:
-        true = step_m(true_xy)
-        moves = true > max(1e-6, 0.25 * float(np.quantile(true, 0.9)))
-        scale = float(np.median(length[moves] / true[moves])) if moves.any() else None
     moving = length[length > 1e-6]
     return Steps(
         way_m=float(length.sum()),
@@ -267,5 +258,4 @@ def steps(odometry: Float[np.ndarray, "t 3"], true_xy: Float[np.ndarray, "t 2"] 
         largest_row=int(np.argmax(length)) + 1,
         sideways=float(np.abs(moved[:, 1]).sum() / max(np.abs(moved[:, :2]).sum(), 1e-9)),
         largest_yaw_rad=float(np.abs(moved[:, 2]).max()),
-        scale=scale,
     )

@@ -1,19 +1,15 @@
-"""How far the frontend can be trusted, measured before anything is scored.
-
-Where a measure takes true positions, its caller has read them.
-"""
+"""How far the frontend can be trusted, measured before anything is scored."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from taojax.runtime.observations import Observations
 from taojax.runtime.retrieval import normalise, retrieve
 from taojax.runtime.scale import NEAR_SPACINGS, view_map
 
-__all__ = ["Places", "Views", "chance", "histogram", "near_m", "places", "views"]
+__all__ = ["Views", "chance", "histogram", "near_m", "views"]
 
 N_QUERIES, N_PAIRS = 1000, 64
 """Queries whose best match is looked up; rows of each side that pair with one another."""
@@ -62,46 +58,9 @@ def _spread(n: int, n_kept: int) -> Int[np.ndarray, " k"]:
     return np.unique(np.linspace(0, n - 1, min(n, n_kept)).astype(int))
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where the queries truly are, against the map."""
-
-    near_m: float
-    """Radius that counts as the same place."""
-
-    nearest_m: Float[np.ndarray, " t"]
-    """From every query to the nearest map pose."""
-
-    right: float
-    """Of the queries that have a map pose within `near_m`: share whose best match is one; NaN where
-    there is none."""
-
-    chance: float
-    """The same for a random answer."""
-
-
 def near_m(spacing_m: float) -> float:
     """Return the radius within which the runtime takes two map images for one place [m]."""
     return NEAR_SPACINGS * spacing_m
-
-
-def places(
-    seen: Views, map_xy: Float[np.ndarray, "m 2"], true_xy: Float[np.ndarray, "t 2"], reach_m: float
-) -> Places:
-    """Hold best matches against the true positions.
-
-    Args:
-        seen: from `views`.
-        map_xy: (M, 2) [m].
-        true_xy: (T, 2) of the queries [m].
-        reach_m: what counts as the same place.
-    """
-    nearest_m, _ = KDTree(map_xy).query(true_xy)
-    there = nearest_m[seen.rows] <= reach_m
-    gap = map_xy[seen.best[there]] - true_xy[seen.rows[there]]
-    is_right = np.hypot(gap[:, 0], gap[:, 1]) <= reach_m
-    right = float(is_right.mean()) if is_right.size else float("nan")
-    return Places(reach_m, np.asarray(nearest_m), right, chance(map_xy, reach_m))
 
 
 def chance(map_xy: Float[np.ndarray, "m 2"], reach_m: float) -> float:

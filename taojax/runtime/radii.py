@@ -1,18 +1,14 @@
 """Which radii suit a site: how near a closure must be to help, and where the map is out of sight.
 
-A proposal from the size of the map, so that no result can lean on it; `SITES` is the rule. Where a
-measure takes true positions, its caller has read them.
+A proposal from the size of the map, so that no result can lean on it; `SITES` is the rule.
 """
 
 import math
 from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import Float
-
 from taojax.runtime.inspection import MapShape
 
-__all__ = ["SITES", "Radii", "drift_m", "suggest_radii"]
+__all__ = ["SITES", "Radii", "suggest_radii"]
 
 
 class Site(NamedTuple):
@@ -52,7 +48,7 @@ def suggest_radii(shape: MapShape, stray_m: float | None = None) -> Radii:
 
     Args:
         shape: of the map.
-        stray_m: `drift_m` of the odometry, where it is known: no closure is placed better than
+        stray_m: drift of the odometry, where it is known: no closure is placed better than
             that, nor better than the map is dense.
     """
     if min(shape.size_m) == 0.0 and max(shape.size_m) > 0.0:
@@ -68,34 +64,6 @@ def suggest_radii(shape: MapShape, stray_m: float | None = None) -> Radii:
     r_in_m = _round_up(least_m)
     r_out_m = max(r_in_m, min(2.0 * r_in_m, SITES[-1].r_out_m))
     return Radii(r_in_m, r_out_m, f"{why}, raised to {name}")
-
-
-def drift_m(
-    odometry: Float[np.ndarray, "t 3"], true_xy: Float[np.ndarray, "t 2"], n_frames: int
-) -> float:
-    """Measure how far odometry strays from the truth over a window.
-
-    Args:
-        odometry: (T, 3) forward [m], left [m], yaw [rad]; row 0 is ignored.
-        true_xy: (T, 2) true positions [m].
-        n_frames: of a window.
-
-    Returns:
-        Median over all windows of the root mean square distance after the best rigid alignment [m].
-    """
-    theta = np.cumsum(np.r_[0.0, odometry[1:, 2]])
-    step = (odometry[1:, 0] + 1j * odometry[1:, 1]) * np.exp(1j * theta[:-1])
-    # Points of the plane are complex numbers: aligning is then one product.
-    own, true = (
-        windows - windows.mean(axis=1, keepdims=True)
-        for windows in (
-            np.lib.stride_tricks.sliding_window_view(points, min(n_frames, len(points)))
-            for points in (np.cumsum(np.r_[0.0, step]), true_xy[:, 0] + 1j * true_xy[:, 1])
-        )
-    )
-    spread = (np.abs(own) ** 2 + np.abs(true) ** 2).sum(axis=1)
-    rest = spread - 2.0 * np.abs((own.conj() * true).sum(axis=1))
-    return float(np.median(np.sqrt(np.maximum(rest, 0.0) / own.shape[1])))
 
 
 def _round_up(least: float) -> float:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taojax.runtime.inspection import clock, map_shape, matched_share, step_m, steps
-from taojax.runtime.radii import SITES, Radii, drift_m
+from taojax.runtime.radii import SITES, Radii
+from taojax.verbs.inspect_truth import drift_m, scale_of
 
 if TYPE_CHECKING:
     from taojax.audit.truth import Truth
@@ -163,11 +164,11 @@ def odometry(
     if found.odometry is None:
         return None
     is_known = truth is not None and len(truth.t_s) == len(found.odometry)
-    moved = steps(found.odometry, truth.xy_m if truth is not None and is_known else None)
+    moved = steps(found.odometry)
     page.head("odometry")
-    other, scale, what = "", moved.scale, "the truth"
-    drift = None
+    other, scale, drift, what = "", None, None, "the truth"
     if truth is not None and is_known:
+        scale = scale_of(found.odometry, truth.xy_m)
         drift = drift_m(found.odometry, truth.xy_m, WINDOW)
     if truth is not None and scale is not None:
         other = f", truth {step_m(truth.xy_m).sum():,.0f} m; {scale:.2f} of the truth (median step)"

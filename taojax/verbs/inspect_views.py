@@ -4,15 +4,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taojax.runtime.likeness import chance, histogram, near_m, places, views
+from taojax.runtime.likeness import chance, histogram, near_m, views
 from taojax.verbs.inspect_page import Page, share
+from taojax.verbs.inspect_truth import places
 
 if TYPE_CHECKING:
     from taojax.audit.truth import Truth
     from taojax.runtime.checkup import Found
     from taojax.runtime.inspection import MapShape, Norms
-    from taojax.runtime.likeness import Places, Views
+    from taojax.runtime.likeness import Views
     from taojax.runtime.radii import Radii
+    from taojax.verbs.inspect_truth import Places
 
 BARELY, CLEAR = 0.04, 0.7
 """A recall so little above chance says that rows are mixed up; one above the other is good."""
