@@ -28,8 +28,12 @@ PLACES_REACH = 4.0
 """A cell of the filter's grid knows an anchor within so many gaps: twice as far as a transition
 may come from."""
 
-IN_ORDER = 3.0
-"""Rows whose median step is longer than so many gaps are in no driving order."""
+IN_ORDER = 0.25
+"""Rows whose median step is longer than so much of the map's extent are in no driving order: of
+shuffled rows it is about the extent itself, of a drive of twenty images a twentieth of it."""
+
+LEAST_ROWS = 20
+"""Maps of fewer rows are taken to be in driving order."""
 
 MOST_UNIT = 4.0
 """A whole piece of evidence takes at most so many gaps of way, however slowly the map changes."""
@@ -76,8 +80,9 @@ def map_spacing_m(xy: np.ndarray) -> float:
     if not steps.size:
         return 1.0
     step = float(np.median(steps[steps >= 0.25 * np.quantile(steps, 0.9)]))
-    gap = gap_m(xy)
-    return step if step <= IN_ORDER * gap else gap
+    extent = float(np.sqrt(np.mean(np.sum((xy - np.mean(xy, axis=0)) ** 2, axis=1))))
+    is_driven = len(xy) < LEAST_ROWS or step <= IN_ORDER * extent
+    return step if is_driven else gap_m(xy)
 
 
 def gap_m(xy: np.ndarray) -> float:
