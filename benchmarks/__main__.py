@@ -95,24 +95,19 @@ def main(arguments: list[str] | None = None) -> int:
     if out.exists() and any(out.iterdir()):
         print(f"{out} is not empty: choose another --out", file=sys.stderr)
         return 3
-    if args.verb == "ablation":
-        from benchmarks import ablation
-
-        ablation.run(out, args.data, only=args.only)
-    elif args.verb == "verdict":
-        from benchmarks import verdict
-
-        verdict.run(out, args.data, only=args.only, write=args.write)
-    elif args.verb == "progress":
-        from benchmarks import progress
-
-        progress.run(out, args.data)
-    elif args.verb in ("gallery", "sweep_speed"):
-        importlib.import_module(f"benchmarks.{args.verb}").run(out)
-    elif args.verb == "refinement":
-        from benchmarks import refinement
-
-        refinement.run(out, args.data, quick=args.quick)
+    # Flags that a benchmark takes beside its folder, by their names.
+    flags = {
+        "ablation": ("data", "only"),
+        "gallery": (),
+        "progress": ("data",),
+        "quality": ("data", "quick", "only"),
+        "refinement": ("data", "quick"),
+        "sweep_speed": (),
+        "verdict": ("data", "only", "write"),
+    }
+    if args.verb in flags:
+        module = importlib.import_module(f"benchmarks.{args.verb}")
+        module.run(out, **{name: getattr(args, name) for name in flags[args.verb]})
     elif args.verb == "speed":
         from benchmarks import speed
 
@@ -121,12 +116,8 @@ def main(arguments: list[str] | None = None) -> int:
         except TaojaxError as error:
             print(error, file=sys.stderr)
             return 5 if isinstance(error, GateError) else 3
-    elif args.verb in ("reliability", "graph"):
-        return {"reliability": _reliability, "graph": _graph}[args.verb](out, args)
     else:
-        from benchmarks import quality
-
-        quality.run(out, args.data, quick=args.quick, only=args.only)
+        return {"reliability": _reliability, "graph": _graph}[args.verb](out, args)
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -10,10 +11,12 @@ import numpy as np
 
 from benchmarks.sets import DataSet
 from taojax import detector
-from taojax.audit import calibration, labels, sequential
+from taojax.audit import calibration, labels, risk, sequential
 from taojax.baselines.frames import Frames
 from taojax.config import Config, StreamConfig
 from taojax.core.adaptive import adaptive_mean
+from taojax.risk import for_run, probability_wrong, shipped
+from taojax.runtime import hindsight
 from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.rivals import SYSTEMS
@@ -34,7 +37,7 @@ UNCOMPILED = ("particles", "particles, injection", "mht", "sue, authors' constan
 SLOW = ("trajectory prior",)
 """Left out of a quick run."""
 
-FITTED = (FUSED, "sticky similarity", "sequential test")
+FITTED = (FUSED, "verdict, now", "verdict, final", "sticky similarity", "sequential test")
 """Learn from the calibration half, so that only their test half counts."""
 
 ORACLES = ("oracle alignment", "oracle levels")
@@ -64,6 +67,9 @@ class Field(NamedTuple):
     """The labels of a set: what the judge knows."""
 
     label: np.ndarray
+    nearest_m: np.ndarray
+    """(T,) distance of the truth from the nearest map pose [m]."""
+
     share: float
     gap: int
 
@@ -78,7 +84,7 @@ def field_of(data: DataSet, config: Config) -> Field:
     """Label the frames of a set and fix its split."""
     nearest = labels.nearest_map_distance(data.truth_m, data.map_poses[:, :2])
     label = labels.label_frames(nearest, data.r_in_m, data.r_out_m)
-    return Field(label, config.audit.calibration_share, config.stream.window)
+    return Field(label, nearest, config.audit.calibration_share, config.stream.window)
 
 
 def log_odds(probability: np.ndarray) -> np.ndarray:
@@ -192,6 +198,41 @@ def _ours(data: DataSet, field: Field, run: tuple[StreamRecord, MapTables, float
     return [*found, Entry(FUSED, "ours", log_odds(probability), place, us + more)]
 
 
+def _verdicts(
+    data: DataSet, field: Field, config: Config, tables: MapTables
+) -> tuple[list[Entry], Entry]:
+    """Answer now and a lag later, the risk refined on the calibration half; and a two-sided rival.
+
+    Returns:
+        Our two entries, and the mean of top-1 over as many frames on both sides.
+    """
+    seen = hindsight.clean(tables, data.odometry, data.index, data.similarity)
+    both = hindsight.replay_both(config.verdict, tables, seen)
+    us = _timed(lambda: hindsight.replay_both(config.verdict, tables, seen), len(data.odometry))
+    audit = config.audit
+    found = []
+    for kind, answer, columns in (
+        ("now", both.now, hindsight.now_columns(both.now)),
+        ("final", both.final, hindsight.delayed_columns(tables, both)),
+    ):
+        base = getattr(for_run(shipped(), audit.max_wrong, config.verdict.lag), kind)
+        place = answer.pose[:, :2].astype(float)
+        error = np.hypot(*(place - data.truth_m).T)
+        half = field.split({name: columns[name] for name in base.columns}).calibration
+        own = risk.own_answers(error, field.nearest_m, audit.wrong_m, audit.r_out_m)
+        cut = risk.Own(own.is_right[half.frame], own.is_wrong[half.frame])
+        p = probability_wrong(risk.refine(base, half, cut, audit.max_wrong), columns)
+        found.append(Entry(f"verdict, {kind}", "ours", log_odds(p), place, us))
+    top1 = 1.0 - np.where(data.index[:, 0] >= 0, data.similarity[:, 0], 0.0).astype(float)
+    lag, total = config.verdict.lag, np.cumsum(np.append(0.0, top1))
+    low = np.maximum(np.arange(len(top1)) - lag, 0)
+    high = np.minimum(np.arange(len(top1)) + lag + 1, len(top1))
+    two_sided = (total[high] - total[low]) / (high - low)
+    top = data.index[:, 0]
+    place = np.where(top[:, None] >= 0, data.map_poses[np.maximum(top, 0), :2], np.nan)
+    return found, Entry("top1, two-sided", "rival", two_sided, place)
+
+
 def compete(
     data: DataSet, config: Config, *, quick: bool = False, names: Collection[str] | None = None
 ) -> tuple[Field, list[Entry]]:
@@ -218,9 +259,13 @@ def compete(
     gates = [
         Entry(name, "rival", np.asarray(run[0].signals[name], float), answer) for name in GATES
     ]
+    audit = replace(config.audit, r_in_m=data.r_in_m, r_out_m=data.r_out_m)
+    verdicts, two_sided = _verdicts(data, field, replace(config, audit=audit), run[1])
     entries = [
         *_ours(data, field, run),
+        *verdicts,
         *gates,
+        two_sided,
         *similarity_filters(top1, field, answer),
         *rivals(data, wanted),
         Entry(ORACLES[0], "oracle", oracle_alignment(data, config.stream, run[1])),

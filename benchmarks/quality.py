@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from benchmarks.entrants import FITTED, GATES, ORACLES, Entry, Field, compete
 from benchmarks.pictures import save
 from benchmarks.sets import DataSet, Recipe, recipes
-from taojax.audit import bootstrap, calibration, metrics, tables
+from taojax.audit import bootstrap, calibration, metrics, risk, tables
 from taojax.audit.labels import CalibrationSplit
 from taojax.config import AuditConfig, Config
 
@@ -86,6 +86,20 @@ def _judge(
     if entry.place_m is not None:
         gap = np.hypot(*(entry.place_m - data.truth_m).T)[known.label == "in_map"]
         row["located"] = float(np.mean(gap <= 2 * data.r_in_m)) if gap.size else NAN
+    # Each is judged on the answer that it gives; signals without one on the frontend's.
+    place = entry.place_m
+    if place is None:
+        top = data.index[:, 0]
+        place = np.where(top[:, None] >= 0, data.map_poses[np.maximum(top, 0), :2], np.nan)
+    error = np.hypot(*(place - data.truth_m).T)
+    own = risk.own_answers(error, known.nearest_m, audit.wrong_m, audit.r_out_m)
+    held_out = risk.Own(own.is_right[test.frame], own.is_wrong[test.frame])
+    row |= risk.risk_row(test.signals[entry.name], held_out)
+    # Of all frames on the map, so that a system which finds fewer places is not favoured.
+    findable = float(np.sum(known.nearest_m[test.frame] <= audit.r_out_m))
+    for name in ("recall_at_p95", "recall_at_p99"):
+        if name in row and findable:
+            row[name] *= float(held_out.is_right.sum()) / findable
     row["us_per_frame"] = entry.us_per_frame
     return _Judged(row, drawn)
 
@@ -159,7 +173,7 @@ def _title(name: str, kind: str, *, is_marked: bool) -> str:
 
 def _differences(rows: Sequence[Row]) -> str:
     """Return the sets one by one: our two main signals against the best rival of each."""
-    ours = [name for name in _in_order(rows, "entrant") if name in ("tao", "probability_map_out")]
+    ours = [name for name in _in_order(rows, "entrant") if name in ("tao", "verdict, final")]
     lines = []
     for name in _in_order(rows, "set"):
         mine = {r["entrant"]: r for r in rows if r["set"] == name}
@@ -189,6 +203,11 @@ def to_markdown(rows: Sequence[Row]) -> str:
     )
     pairs = {
         "Test half: AUROC / FAR@95": ("auroc_test", "far_at_95_test"),
+        "Test half: area under the risk-coverage curve of the own answers (small is good) / right "
+        "answers of frames on the map that can be accepted while 95 % of the accepted are right": (
+            "aurc",
+            "recall_at_p95",
+        ),
         "All labelled frames: AUROC / FAR@95 († saw the labels of the first half)": (
             "auroc",
             "far_at_95",

@@ -25,7 +25,16 @@ from taojax.runtime.rivals import dense_lists
 from taojax.runtime.score import candidates
 from taojax.tables import MOTION, read_table, stacked
 
-REAL = {"mit_corridor": (5.0, 10.0), "intel_lab": (1.5, 3.0), "tuc_corridor_mapout": (2.0, 4.0)}
+REAL = {
+    "mit_corridor": (5.0, 10.0),
+    "freiburg_campus": (5.0, 10.0),
+    "intel_lab": (1.5, 3.0),
+    "tuc_corridor_mapout": (2.0, 4.0),
+    "radar_kaist01": (5.0, 10.0),
+    "radar_dcc01": (5.0, 10.0),
+    "radar_riverside01": (5.0, 10.0),
+    "radar_oxford00": (5.0, 10.0),
+}
 """Real recordings -> r_in, r_out [m]."""
 
 ALIASES = (0.05, 0.25, 0.45, 0.6, 0.7)
