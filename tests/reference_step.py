@@ -8,7 +8,7 @@ import reference
 from conftest import loop, motions
 
 T, M, K, N, H, SEEDS = 36, 60, 7, 6, 9, 4
-LAMBDA, GAMMA, TAU, DELTAS, MASKS = 0.7, 25.0, 0.8, 1.7, 1.9
+LAMBDA, GAMMA, TAU, DELTAS, MASKS = 0.7, 25.0, 0.8, 1.7, 1.2
 MEMORY, KAPPA, TEMPERATURE, EPS, RECALL = 4.0, 2.2, 0.11, 1e-3, 0.9
 PLACES = loop(M)
 
