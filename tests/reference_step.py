@@ -8,19 +8,20 @@ import reference
 from conftest import loop, motions
 
 T, M, K, N, H, SEEDS = 36, 60, 7, 6, 9, 4
-LAMBDA, GAMMA, TAU, DELTAS, MASKS = 0.7, 25.0, 0.8, 1.7, 1.9
+LAMBDA, GAMMA, TAU, DELTAS, MASKS = 0.7, 25.0, 0.8, 1.7, 1.2
 MEMORY, KAPPA, TEMPERATURE, EPS, RECALL = 4.0, 2.2, 0.11, 1e-3, 0.9
 PLACES = loop(M)
+PLACES[18:27, 2] += np.pi  # a stretch that the map drove the other way
 
 
 def made(seed):
-    """A noisy drive: odometry, lists with gaps and one without any, weights of all sizes."""
+    """A noisy drive: odometry, lists with holes and one without any, weights of all sizes."""
     rng, queries = np.random.default_rng(seed), loop(T)
     away = np.linalg.norm(queries[:, None, :2] - PLACES[None, :, :2], axis=2)
     rows = np.exp(-away / 10) + rng.normal(0, 0.2, away.shape)
     index = np.argsort(-rows, axis=1)[:, :K].astype(np.int32)
     similarity = np.clip(np.take_along_axis(rows, index, 1), -1, 1)
-    index[::5, 2:5], index[17] = -1, -1
+    index[::5, 2:5], index[17], index[[13, 23, 29], :2] = -1, -1, -1
     odometry = motions(queries) + rng.normal(0, [0.3, 0.1, 0.03], (T, 3))
     weight = rng.uniform(0.2, 3, T)
     weight[11] = 0.0
@@ -79,7 +80,7 @@ class Stream:
         xy = self.xy[self.index[t][there]]
         row["entropy"], row["velocity"] = -np.sum(share * np.log(share)), 0.0
         row["sue"] = np.sum(near @ (xy - near @ xy) ** 2)
-        if t and self.index[t - 1, 0] >= 0:
+        if t and self.index[t - 1, 0] >= 0 and self.index[t, 0] >= 0:
             jump = np.linalg.norm(xy[0] - self.xy[self.index[t - 1, 0]])
             row["velocity"] = abs(jump - np.linalg.norm(self.odometry[t, :2]))
         return row
@@ -118,8 +119,8 @@ class Stream:
         backwards = inside[posed][::-1]
         support = 1 - inside[posed].sum() / len(past)
         stale = np.argmax(backwards) if backwards.any() else N
-        return row, {"support": support, "stale": stale, "index": self.index[t, posed],
-                     "pose": poses[posed]}  # fmt: skip
+        said = {"support": support, "stale": stale, "index": self.index[t, posed]}
+        return row, said | {"pose": poses[posed], "is_second": posed != best}
 
     # Joint branches.
 

@@ -10,6 +10,7 @@ import pytest
 import reference_step as by_hand
 
 from taojax.config import StreamConfig
+from taojax.core.adaptive import adaptive_mean
 from taojax.errors import InputError
 from taojax.records import signal_names
 from taojax.runtime.frames import Frame
@@ -55,7 +56,8 @@ def drive(request):
     return *got, *by_hand.Stream(TABLES, *data).rows()
 
 
-def test_no_signal_is_left_out(drive):
+def test_no_signal_is_left_out_and_the_drives_are_hard(drive):
+    assert any(answer["is_second"] for answer in drive[3])
     assert set(drive[2][0]) == set(signal_names()) - {"stale"}
 
 
@@ -83,6 +85,17 @@ def test_the_answer_of_the_best_rank_branch_equals_numpy(drive):
         if t >= 2 and answer["index"] >= 0:
             assert rank.map_index[t] == answer["index"]
             np.testing.assert_allclose(rank.pose[t, :2], answer["pose"][:2], atol=0.02)
+
+
+@pytest.mark.parametrize("before", [0.05, 0.4, 0.95])
+@pytest.mark.parametrize("now", [0.02, 0.5, 0.97])
+def test_the_adaptive_memory_is_lepskis_rule_before_and_after_a_seam(before, now, rng):
+    costs = np.clip(rng.normal(before, 0.05, 60), 0, 1)
+    for seam in (1, 4, 12, 40):
+        costs[:seam] = np.clip(rng.normal(now, 0.05, seam), 0, 1)
+        for n in (1, 7, 60):
+            got = adaptive_mean(jnp.asarray(costs, jnp.float32), jnp.arange(60) < n)
+            np.testing.assert_allclose(got, by_hand.lepski(costs[:n]), rtol=1e-4)
 
 
 def literal(weight, seed=1):
