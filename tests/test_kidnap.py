@@ -272,9 +272,7 @@ def test_recovery_csv_begins_with_the_columns_of_the_contract(done):
     keys = [(row["method"], row["drift"]) for row in rows]
     assert len(keys) == len(set(keys))
     kinds = ("now", "final", "tao", "tao_rank")
-    assert {(kind, level) for kind in kinds for level in LEVELS} == set(
-        keys
-    )
+    assert {(kind, level) for kind in kinds for level in LEVELS} == set(keys)
     for row in rows:
         assert int(row["trials"]) >= 4
         assert 0.0 <= float(row["recovered"]) <= 1.0

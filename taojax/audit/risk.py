@@ -118,7 +118,7 @@ def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> R
             apart = _moved(base, z[others], own.is_wrong[others])
             unseen[part] = probability_wrong(apart, there)
     levels = np.array([
-        np.minimum(level, checked_level(unseen, own, most))
+        np.minimum(level, checked_level(unseen, own, most, level))
         for level, most in zip(base.levels, base.max_wrongs, strict=True)
     ])  # fmt: skip
     refined = at_most(refined._replace(levels=levels), max_wrong)
@@ -150,19 +150,23 @@ def _moved(base: Risk, z: Float[np.ndarray, "n f"], is_wrong: Bool[np.ndarray, "
     return base._replace(weight=numbers[:-1], bias=float(numbers[-1]))
 
 
-def checked_level(p: Float[np.ndarray, " n"], own: Own, max_wrong: float) -> float:
+def checked_level(
+    p: Float[np.ndarray, " n"], own: Own, max_wrong: float, pooled: float = 1.0
+) -> float:
     """Return the highest level at which accepted answers keep the promise in a harsher world.
 
     Args:
         p: probability of being wrong.
         own: right or wrong, of the same answers.
         max_wrong: share of the accepted answers that may be wrong.
+        pooled: the level of the pooled numbers.
 
     Returns:
-        1 where too few answers are right to tell, NaN where no level keeps it.
+        NaN where no level keeps it. Where too few answers are right to tell, the pooled level, but
+        NaN if that would accept any wrong one.
     """
     if own.is_right.sum() < LEAST_RIGHT:
-        return 1.0
+        return float("nan") if np.any(own.is_wrong & (p <= pooled)) else pooled
     known = own.is_right | own.is_wrong
     order = np.lexsort((~own.is_wrong[known], p[known]))
     value, wrong = p[known][order], own.is_wrong[known][order]
@@ -193,10 +197,15 @@ def promise_words(refined: Risk, p: Float[np.ndarray, " n"], own: Own) -> str:
         could = (
             f"--max-wrong {min(kept):g} could be kept" if kept else "no --max-wrong could be kept"
         )
+        why = (
+            f"even the most trusted answers are wrong too often for {most:.0%} when each wrong one "
+            f"counts {HARSHER:g} times"
+        )
+        if n_right < LEAST_RIGHT:
+            why = f"wrong answers look right and fewer than {LEAST_RIGHT} are right"
         return (
-            f"nothing is accepted: in {half} even the most trusted answers are wrong too often for "
-            f"{most:.0%} when each wrong one counts {HARSHER:g} times; {could}; better descriptors "
-            "or a longer drive on the map would help"
+            f"nothing is accepted: in {half} {why}; {could}; better descriptors or a longer drive "
+            "on the map would help"
         )
     if n_right < LEAST_RIGHT:
         return (

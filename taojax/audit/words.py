@@ -162,7 +162,8 @@ def _alone(judgement: Judgement, rates: Mapping[str, Mapping[str, Any]]) -> list
         return []
     level = plain(judgement.detector.threshold)
     return [
-        f"The probability alone, which cannot abstain, would at the threshold {level}, frozen on "
+        f"The probability of being off the map alone, which cannot abstain, would at the threshold "
+        f"{level}, frozen on "
         f"the calibration split, {' and '.join(parts)}."
     ]
 

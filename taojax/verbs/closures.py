@@ -21,7 +21,7 @@ class Closures:
     """
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = tyro.MISSING
-    """Run folder with verdicts: audited, or scored with --calibration."""
+    """Run folder with verdicts: scored or audited."""
 
     out: Annotated[Path | None, flag("DIR", "RUN")] = None
     """Where to write closures.g2o, rejected.g2o and trajectory.tum."""
@@ -80,5 +80,6 @@ def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
     n, n_off = int(accepted.sum()), int((accepted & (labels["label"] == "map_out")).sum())
     return (
         f"audit           {n_off} of the {n} accepted of {where} lie off the map"
-        f"{'; do not use these closures' if 2 * n_off > n else ''}; give closures a robust kernel"
+        f"{'; do not use these closures' if 2 * n_off > n else ''}; of the accepted, how many are"
+        " right: tables/verdicts.csv"
     )
