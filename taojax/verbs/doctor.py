@@ -18,6 +18,7 @@ PACKAGES = (
 
 EXTRAS = {
     "export": (("flatbuffers",), "taojax export"),
+    "graph": (("gtsam",), "taojax graph"),
     "ros": (("rosbags",), "odometry out of ROS bags"),
     "cuda": (("jax_cuda13_plugin",), "an NVIDIA GPU"),
     "notebooks": (("jupytext", "jupyterlab"), "the notebooks"),
