@@ -236,8 +236,12 @@ def dense(config, places, motion):
         step_xy = np.array([[face[0], -face[1]], [face[1], face[0]]]) @ motion[:2]
         for direction, sign in ((0, -1.0), (1, 1.0)):
             at = xy[anchor] + sign * step_xy
-            source = int(find(grid, jnp.asarray(at, jnp.float32)))
-            if source < 0 or ((xy[source] - at) ** 2).sum() >= (config.reach_gaps * gap) ** 2:
+            # The grid says whether there is any anchor, the nearest of all is where it came from.
+            source = int(np.argmin(((xy - at) ** 2).sum(axis=1)))
+            if (
+                int(find(grid, jnp.asarray(at, jnp.float32))) < 0
+                or ((xy[source] - at) ** 2).sum() >= (config.reach_gaps * gap) ** 2
+            ):
                 continue
             same = direction if facing[source] @ face >= 0 else 1 - direction
             row = direction * m + anchor

@@ -113,9 +113,16 @@ def test_a_closure_leads_from_its_map_pose_to_the_answered_pose(run):
         want = [sealed.delayed[c][t] for c in ("x_m", "y_m", "theta_rad")]
         np.testing.assert_allclose(matrix(vertices[a]) @ matrix(motion), matrix(want), atol=1e-6)
         np.testing.assert_allclose(vertices[b], want, atol=1e-6)
-        delta = 3.0 * sealed.manifest["map_spacing_m"]
-        want = np.diag([1 / delta**2, 1 / delta**2, (6 / 3.0) ** 2])
-        np.testing.assert_allclose(information, want, rtol=1e-6, atol=1e-9)
+        # Of the posterior within its place, turned from the map into the axes of the pose.
+        held = [sealed.delayed[c][t] for c in ("var_x_m2", "cov_xy_m2", "var_y_m2")]
+        c, s = np.cos(want[2]), np.sin(want[2])
+        turn = np.array([[c, s], [-s, c]])
+        precision = np.zeros((3, 3))
+        precision[:2, :2] = np.linalg.inv(
+            turn @ np.array([[held[0], held[1]], [held[1], held[2]]]) @ turn.T
+        )
+        precision[2, 2] = (6 / 3.0) ** 2
+        np.testing.assert_allclose(information, precision, rtol=1e-6, atol=1e-6)
 
 
 def test_the_maps_own_edges_keep_it_as_it_is(run):
