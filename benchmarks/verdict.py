@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import minimize
 from tqdm import tqdm
 
 from benchmarks.pool import Recording, recipes
 from taojax import risk as numbers
 from taojax.audit import labels
 from taojax.audit import risk as judge
+from taojax.audit.calibration import fit_logistic
 from taojax.config import AuditConfig, VerdictConfig
 from taojax.risk import Calibration, Risk, at_most, probability_wrong
 from taojax.runtime import hindsight
@@ -113,22 +113,22 @@ def pooled(recordings: Sequence[Judged], kind: str, promise: str) -> Risk:
         xs.append(_table(one, kind))
         ys.append(own.is_wrong)
         ws.append(np.full(len(xs[-1]), 1.0 / len(xs[-1]) / np.sqrt(n_family[one.family])))
-    x, y, w = np.concatenate(xs), np.concatenate(ys).astype(float), np.concatenate(ws)
+    x, y, w = np.concatenate(xs), np.concatenate(ys), np.concatenate(ws)
     w *= POOLED_WEIGHT / w.sum()
     mean = (w @ x) / w.sum()
     scale = np.sqrt(w @ (x - mean) ** 2 / w.sum()) + 1e-6
     z = (x - mean) / scale
 
-    def loss(q: np.ndarray) -> tuple[float, np.ndarray]:
-        odds = z @ q[:-1] + q[-1]
-        residual = w * (1.0 / (1.0 + np.exp(-odds)) - y)
-        value = np.sum(w * (np.logaddexp(0.0, odds) - y * odds)) + 0.5 * RIDGE * np.sum(q[:-1] ** 2)
-        return float(value), np.append(z.T @ residual + RIDGE * q[:-1], residual.sum())
-
     # Larger features mean more likely wrong. With free weights twice as many answers that are
     # accepted on left-out recordings are wrong, at the same recall.
-    bounds = [(0.0, None)] * z.shape[1] + [(None, None)]
-    q = minimize(loss, np.zeros(z.shape[1] + 1), jac=True, method="L-BFGS-B", bounds=bounds).x
+    q = fit_logistic(
+        z,
+        y,
+        w,
+        start=np.zeros(z.shape[1] + 1),
+        precision=np.append(np.full(z.shape[1], RIDGE), 0.0),
+        is_signed=False,
+    )
     shares = np.array(MAX_WRONGS)
     levels = LEVEL_OVER_SHARE * shares
     return Risk(columns_of(kind), mean, scale, q[:-1], float(q[-1]), shares, levels, 0.05, promise)

@@ -111,10 +111,6 @@ class VerdictConfig(eqx.Module):
     """Log likelihood ratio of a strong match against background, per whole piece of evidence,
     > 0."""
 
-    most_unit_gaps: Scalar = 4.0
-    """A frame counts by the way since the last one over the way in which the map's descriptors
-    change (their correlation length), which is capped at so many gaps, >= 1."""
-
     leave: Scalar = 0.02
     """Probability of leaving the map per unit of way, in (0, 1)."""
 
@@ -143,7 +139,6 @@ class VerdictConfig(eqx.Module):
         """Refuse impossible settings while the caller's line is on the stack."""
         _check_range("lag", self.lag, 0, 1001)
         _check_range("window_frames", self.window_frames, 4, 1001)
-        _check_range("most_unit_gaps", self.most_unit_gaps, 1.0)
         for name in ("leave", "come_back", "start_off"):
             _check_range(name, getattr(self, name), 1e-9, 1.0)
         for name in ("evidence", "step_gaps", "reach_gaps", "place_gaps", "near_gaps"):

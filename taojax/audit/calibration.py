@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from taojax.audit.labels import CalibrationSplit
 from taojax.detector import LIST_RECALL, Detector, probability
@@ -34,6 +34,9 @@ every frame, and a list that agrees with itself, can be believed."""
 
 PRIOR_PRECISION = 10.0
 """How firmly the weights hold to the prior; one labelled effective frame weighs about 1/4."""
+
+BIAS_PRECISION = 0.01
+"""How firmly the bias holds to zero: hardly, for it follows how many frames are off the map."""
 
 CORRELATED_FRAMES = 8.0
 """Neighbouring frames repeat each other: so many count as one."""
@@ -80,6 +83,54 @@ def _note(n_in: int, n_out: int) -> str:
     )
 
 
+def effective_weights(is_positive: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return what each frame counts, so that a class counts by its effective frames.
+
+    Args:
+        is_positive: the class of every frame.
+    """
+    counts = np.array([(~is_positive).sum(), is_positive.sum()])
+    effective = np.minimum(MOST_EFFECTIVE, counts / CORRELATED_FRAMES) / np.maximum(counts, 1)
+    return effective[is_positive.astype(int)]
+
+
+def fit_logistic(
+    z: Float[np.ndarray, "n f"],
+    is_positive: Bool[np.ndarray, " n"],
+    frame_weight: Float[np.ndarray, " n"],
+    *,
+    start: Float[np.ndarray, " g"],
+    precision: Float[np.ndarray, " g"],
+    is_signed: bool = True,
+) -> Float[np.ndarray, " g"]:
+    """Return weights and bias of the likeliest logistic model under a Gaussian prior.
+
+    Args:
+        z: standardised features.
+        is_positive: the class whose log odds are modelled.
+        frame_weight: what each frame counts.
+        start: mean of the prior, the bias last (g = f + 1).
+        precision: of the prior around it.
+        is_signed: False allows no negative weight.
+    """
+    from scipy.optimize import minimize
+
+    y = is_positive.astype(float)
+
+    def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        # Summed by hand: a matrix product may round differently for other numbers of frames.
+        odds, pull = np.sum(z * numbers[None, :-1], axis=1) + numbers[-1], numbers - start
+        surprise = frame_weight * (np.logaddexp(0.0, odds) - y * odds)
+        residual = frame_weight * (1.0 / (1.0 + np.exp(-odds)) - y)
+        slope = np.append(np.sum(residual[:, None] * z, axis=0), residual.sum())
+        value = surprise.sum() + 0.5 * np.sum(precision * pull**2)
+        return float(value), slope + precision * pull
+
+    low = None if is_signed else 0.0
+    bounds = [(low, None)] * z.shape[1] + [(None, None)]
+    return minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+
+
 def fit(
     calibration: CalibrationSplit,
     map_recall: float = LIST_RECALL,
@@ -97,30 +148,19 @@ def fit(
         The detector. Its threshold is the level that accepts 95 % of the in-map calibration
         frames; NaN where there is none.
     """
-    from scipy.optimize import minimize
-
     weights = prior(map_recall)
     x = np.stack([np.asarray(calibration.signals[name], float) for name in weights], axis=1)
     mean, spread = x.mean(axis=0), x.std(axis=0)
     scale = np.where(spread > _TINY, spread, 1.0)
     known = calibration.is_in | calibration.is_out
-    z, y = ((x - mean) / scale)[known], calibration.is_out[known].astype(float)
-    counts = np.array([(y == 0).sum(), (y == 1).sum()])
-    effective = np.minimum(MOST_EFFECTIVE, counts / CORRELATED_FRAMES) / np.maximum(counts, 1)
-    frame_weight = effective[y.astype(int)]
-    expected = np.array(list(weights.values()))
-
-    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        weight, bias = parameters[:-1], parameters[-1]
-        log_odds = np.sum(z * weight[None], axis=1) + bias
-        surprise = frame_weight * (np.logaddexp(0.0, log_odds) - y * log_odds)
-        residual = frame_weight * (1.0 / (1.0 + np.exp(-log_odds)) - y)
-        pull = weight - expected
-        value = surprise.sum() + 0.5 * PRIOR_PRECISION * np.sum(pull**2) + 0.005 * bias**2
-        slope = np.sum(residual[:, None] * z, axis=0) + PRIOR_PRECISION * pull
-        return float(value), np.append(slope, residual.sum() + 0.01 * bias)
-
-    best = minimize(loss, np.append(expected, 0.0), jac=True, method="L-BFGS-B").x
+    is_out = calibration.is_out[known]
+    best = fit_logistic(
+        ((x - mean) / scale)[known],
+        is_out,
+        effective_weights(is_out),
+        start=np.append(list(weights.values()), 0.0),
+        precision=np.append(np.full(len(weights), PRIOR_PRECISION), BIAS_PRECISION),
+    )
     # Told from the mean in-map frame, a term says what makes a frame unlike the places it knows.
     level = x[calibration.is_in].mean(axis=0) if calibration.is_in.any() else mean
     detector = Detector(
@@ -130,7 +170,7 @@ def fit(
         weight=best[:-1],
         bias=float(best[-1] + np.sum((level - mean) / scale * best[:-1])),
         threshold=float("nan"),
-        note=_note(int(counts[0]), int(counts[1])),
+        note=_note(int((~is_out).sum()), int(is_out.sum())),
     )
     inside = probability(detector, calibration.signals)[calibration.is_in]
     return detector._replace(threshold=accepting_level(inside))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from taojax.audit.calibration import CORRELATED_FRAMES, effective_weights, fit_logistic
 from taojax.audit.labels import CalibrationSplit
 from taojax.risk import Risk, at_most, probability_wrong
 
@@ -21,12 +22,6 @@ OF_THE_WAY = 0.5
 narrow view of its other half. Of the left-out recordings all of it accepts .77 of the right answers
 and has one more with more than .15 wrong; half of it .75, none of it .71 and three times the wrong
 share (`python -m benchmarks verdict`)."""
-
-CORRELATED_FRAMES = 8.0
-"""Neighbouring answers are right and wrong together: so many count as one."""
-
-MOST_EFFECTIVE = 40.0
-"""Effective frames of a class at most, so that a long standstill does not outvote the prior."""
 
 HARSHER = 4.0
 """The odds of being wrong may be so many times higher on the frames to come than on the
@@ -132,25 +127,16 @@ def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> R
 
 def _moved(base: Risk, z: Float[np.ndarray, "n f"], is_wrong: Bool[np.ndarray, " n"]) -> Risk:
     """Return the numbers moved part of the way to what fits some labelled answers."""
-    from scipy.optimize import minimize
-
-    y = is_wrong.astype(float)
-    counts = np.array([(y == 0).sum(), (y == 1).sum()])
-    effective = np.minimum(MOST_EFFECTIVE, counts / CORRELATED_FRAMES) / np.maximum(counts, 1)
-    frame_weight = effective[is_wrong.astype(int)]
     start = np.append(base.weight, base.bias)
-    precision = np.append(np.full(len(base.weight), PRIOR_PRECISION), BIAS_PRECISION)
-
-    def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
-        odds, pull = z @ numbers[:-1] + numbers[-1], numbers - start
-        surprise = frame_weight * (np.logaddexp(0.0, odds) - y * odds)
-        residual = frame_weight * (1.0 / (1.0 + np.exp(-odds)) - y)
-        slope = np.append(z.T @ residual, residual.sum()) + precision * pull
-        return float(surprise.sum() + 0.5 * np.sum(precision * pull**2)), slope
-
     # Every feature is larger where an answer is more likely wrong: a negative weight is chance.
-    bounds = [(0.0, None)] * len(base.weight) + [(None, None)]
-    fitted = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    fitted = fit_logistic(
+        z,
+        is_wrong,
+        effective_weights(is_wrong),
+        start=start,
+        precision=np.append(np.full(len(base.weight), PRIOR_PRECISION), BIAS_PRECISION),
+        is_signed=False,
+    )
     numbers = start + OF_THE_WAY * (fitted - start)
     return base._replace(weight=numbers[:-1], bias=float(numbers[-1]))
 
@@ -172,11 +158,8 @@ def checked_level(
     """
     if own.is_right.sum() < LEAST_RIGHT:
         return float("nan") if np.any(own.is_wrong & (p <= pooled)) else pooled
-    known = own.is_right | own.is_wrong
-    order = np.lexsort((~own.is_wrong[known], p[known]))
-    value, wrong = p[known][order], own.is_wrong[known][order]
-    n_wrong, n_right = HARSHER * np.cumsum(wrong), np.cumsum(~wrong)
-    is_last = np.append(value[1:] > value[:-1], True)
+    value, wrong, n_right, is_last = _sorted(p, own)
+    n_wrong = HARSHER * wrong
     keeps = is_last & (n_right >= LEAST_ACCEPTED) & (n_wrong <= max_wrong * (n_wrong + n_right))
     if not keeps.any():
         return float("nan")
@@ -208,8 +191,8 @@ def promise_words(refined: Risk, p: Float[np.ndarray, " n"], own: Own) -> str:
             f"--max-wrong {min(kept):g} could be kept" if kept else "no --max-wrong could be kept"
         )
         why = (
-            f"too few right answers are trusted, or wrong ones among them too often for {most:.0%} "
-            f"when each wrong one counts {HARSHER:g} times"
+            f"even the most trusted answers are wrong too often for {most:.0%} when each wrong one "
+            f"counts {HARSHER:g} times or too few right ones are trusted"
         )
         if n_right < LEAST_RIGHT:
             why = f"wrong answers look right and fewer than {LEAST_RIGHT} are right"
@@ -240,13 +223,16 @@ def promise_words(refined: Risk, p: Float[np.ndarray, " n"], own: Own) -> str:
     )
 
 
-def _sorted(signal: np.ndarray, own: Own) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return wrong and right so far, and where ties end, most trusted first; ties count against."""
+def _sorted(signal: np.ndarray, own: Own) -> tuple[np.ndarray, ...]:
+    """Return values, wrong and right so far, and where ties end, most trusted first.
+
+    Ties count against.
+    """
     known = own.is_right | own.is_wrong
     order = np.lexsort((~own.is_wrong[known], signal[known]))
     value, wrong = signal[known][order], own.is_wrong[known][order]
     is_last = np.append(value[1:] > value[:-1], True)[: len(value)]
-    return np.cumsum(wrong), np.cumsum(~wrong), is_last
+    return value, np.cumsum(wrong), np.cumsum(~wrong), is_last
 
 
 def risk_row(signal: Float[np.ndarray, " n"], own: Own) -> dict[str, float]:
@@ -264,7 +250,7 @@ def risk_row(signal: Float[np.ndarray, " n"], own: Own) -> dict[str, float]:
     """
     if np.isnan(signal).any() or not (own.is_right | own.is_wrong).any():
         return {}
-    wrong, right, is_last = _sorted(signal, own)
+    _, wrong, right, is_last = _sorted(signal, own)
     row = {"aurc": float(np.mean(wrong / (wrong + right)))}
     if right[-1]:
         for name, precision in (("recall_at_p95", 0.95), ("recall_at_p99", 0.99)):
@@ -285,7 +271,7 @@ def risk_coverage(
     """
     if np.isnan(signal).any() or not (own.is_right | own.is_wrong).any():
         return np.zeros(0), np.zeros(0)
-    wrong, right, _ = _sorted(signal, own)
+    _, wrong, right, _ = _sorted(signal, own)
     coverage = np.arange(1, steps + 1) / steps
     rows = np.maximum(np.ceil(coverage * len(wrong)).astype(int), 1) - 1
     return coverage, wrong[rows] / (wrong[rows] + right[rows])

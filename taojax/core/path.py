@@ -40,12 +40,6 @@ class Window(eqx.Module):
 class Support(eqx.Module):
     """What the frames around an answer say of it."""
 
-    pose: Float[Array, "3"]
-    """The answer moved by the closed-form fit: x [m], y [m], theta [rad]."""
-
-    shift_gaps: Float[Array, ""]
-    """How far the fit moved it, gaps."""
-
     cost: Float[Array, ""]
     """Mean of Eq. 1's geometric and similarity terms along the path, 0 to 1."""
 
@@ -88,7 +82,7 @@ def support(
         window: the frames.
 
     Returns:
-        The refined answer and the figures; all finite, also without any candidate.
+        The figures, after the fit; all finite, also without any candidate.
 
     Source:
         Paper, section 3.2 and Eq. 1: rho_delta of the residuals after the closed-form fit, plus
@@ -118,8 +112,6 @@ def support(
     fitted = jnp.where(fit.is_degenerate, pose, fit.T_map_odom)
     relative, price, chosen = priced(fitted)
     return Support(
-        pose=fitted,
-        shift_gaps=jnp.sqrt(jnp.sum((fitted[:2] - pose[:2]) ** 2)) / gap_m,
         cost=jnp.sum(window.weight * price[rows, chosen]) / total,
         vote=jnp.sum(jnp.where(relative[:, 0] <= 1.0, window.weight, 0.0)) / total,
         listed=jnp.sum(jnp.where(jnp.any(relative <= 1.0, axis=1), window.weight, 0.0)) / total,

@@ -407,9 +407,6 @@ def advance_blocks(
 class Reach(NamedTuple):
     """How many frames around each are looked at, by what they count as."""
 
-    back: Int[np.ndarray, " t"]
-    """One window back."""
-
     far_back: Int[np.ndarray, " t"]
     """`LONG_PAST` windows back."""
 
@@ -433,12 +430,11 @@ def reach(config: VerdictConfig, places: Places, odometry: np.ndarray) -> Reach:
     slack = 1e-3  # rounding must not cost a frame
     width, lag = config.window_frames, config.lag
 
-    def before(n: int) -> np.ndarray:
-        back = at - np.searchsorted(frames, frames - n + slack, side="right") + 1
-        return np.clip(back, n, LONGEST * width)
-
+    far = LONG_PAST * width
+    back = at - np.searchsorted(frames, frames - far + slack, side="right") + 1
+    back = np.clip(back, far, LONGEST * width)
     ahead = np.searchsorted(frames, frames + lag - slack) - at
-    return Reach(before(width), before(LONG_PAST * width), np.clip(ahead, lag, LONGEST * lag))
+    return Reach(back, np.clip(ahead, lag, LONGEST * lag))
 
 
 def cut(  # noqa: PLR0913 - a log and where to cut it
