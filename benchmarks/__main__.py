@@ -25,6 +25,9 @@ def _parser() -> argparse.ArgumentParser:
     verdict.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     verdict.add_argument("--only", default="", help="only recordings whose name contains this")
     verdict.add_argument("--write", action="store_true", help="replace the default calibration")
+    promise = verbs.add_parser("promise", help="is the promise kept on 1,000 simulated recordings")
+    promise.add_argument("--quick", action="store_true", help="fifty recordings")
+    promise.add_argument("--out", type=Path, help="folder to make (default runs/promise/TIME)")
     ablation = verbs.add_parser("ablation", help="what each ingredient is worth")
     ablation.add_argument("--out", type=Path, help="folder to make (default runs/ablation/TIME)")
     ablation.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
@@ -100,6 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
         "ablation": ("data", "only"),
         "gallery": (),
         "progress": ("data",),
+        "promise": ("quick",),
         "quality": ("data", "quick", "only"),
         "refinement": ("data", "quick"),
         "sweep_speed": (),

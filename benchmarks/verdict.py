@@ -40,6 +40,9 @@ recordings with .017 wrong, at 2.4 times .05 they accept .69 with .035."""
 
 MAX_WRONGS = (0.01, 0.02, 0.05, 0.1, 0.2)
 
+GAP_FRAMES = 20
+"""Between the half that calibrates and the half that is judged."""
+
 LEAST_RIGHT = 10
 """Right answers without which recall is not told."""
 
@@ -134,23 +137,38 @@ def pooled(recordings: Sequence[Judged], kind: str, promise: str) -> Risk:
     return Risk(columns_of(kind), mean, scale, q[:-1], float(q[-1]), shares, levels, 0.05, promise)
 
 
-def _halves(one: Judged) -> tuple[Bool[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
+def halves(one: Judged) -> tuple[Bool[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
+    """Return which frames calibrate and which are judged, `GAP_FRAMES` between them."""
     n = len(one.answers.now.is_right)
     at = np.arange(n)
-    return at < n // 2, at >= n // 2 + 20
+    return at < n // 2, at >= n // 2 + GAP_FRAMES
+
+
+def half_numbers(one: Judged, kind: str, use: str, risk: Risk) -> Risk:
+    """Return the numbers that judge a recording's second half.
+
+    Args:
+        one: the recording.
+        kind: now or final.
+        use: shipped, or refined on the first half.
+        risk: numbers that have not seen the recording.
+    """
+    if use == "shipped":
+        return risk
+    first, _ = halves(one)
+    own, columns = getattr(one.answers, kind), getattr(one, kind)
+    cut = {name: columns[name][first] for name in risk.columns}
+    # The judge's own splitter makes the calibration half; here it has no gap to leave.
+    label = np.full(int(first.sum()), "grey")
+    split = labels.split_frames(cut, label, calibration_share=1.0, gap_frames=0).calibration
+    return judge.refine(risk, split, judge.Own(own.is_right[first], own.is_wrong[first]), 0.05)
 
 
 def _row(one: Judged, kind: str, use: str, risk: Risk) -> dict[str, Any]:
     """Judge the second half of a left-out recording."""
-    first, second = _halves(one)
+    _, second = halves(one)
     own, columns = getattr(one.answers, kind), getattr(one, kind)
-    if use == "refined":
-        cut = {name: columns[name][first] for name in risk.columns}
-        # The judge's own splitter makes the calibration half; here it has no gap to leave.
-        label = np.full(int(first.sum()), "grey")
-        split = labels.split_frames(cut, label, calibration_share=1.0, gap_frames=0).calibration
-        half = judge.Own(own.is_right[first], own.is_wrong[first])
-        risk = judge.refine(risk, split, half, 0.05)
+    risk = half_numbers(one, kind, use, risk)
     p = probability_wrong(risk, columns)
     accepted = second & (p <= risk.level)
     right, wrong = accepted & own.is_right, accepted & own.is_wrong

@@ -41,6 +41,10 @@ MOST_UNIT = 4.0
 MAX_CELLS = 1500
 """Cells along the longer side at most; a larger map gets coarser cells, not more memory."""
 
+LEAST_CELL_BITS = 14
+"""Smaller grids are padded to two to the power of this many cells, larger ones to the next power:
+maps of as many rows share compiled programs."""
+
 
 class MapTables(eqx.Module):
     """What `step` needs to know of the map; made once by `map_tables`."""
@@ -112,6 +116,9 @@ def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
     centres = [low[axis] + (np.arange(shape[axis]) + 0.5) * cell_m for axis in (0, 1)]
     points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1).reshape(-1, 2)
     distance, nearest = tree.query(points, distance_upper_bound=reach)
+    # Padded, because every length of this table is compiled for anew.
+    cells = np.full(1 << max(int(len(points) - 1).bit_length(), LEAST_CELL_BITS), -1, np.int32)
+    cells[: len(points)] = np.where(np.isfinite(distance), nearest, -1)
     n_neighbours = min(NEIGHBOURS, len(xy))
     gap, neighbour = tree.query(xy, k=n_neighbours)
     gap, neighbour = gap.reshape(len(xy), -1).T, neighbour.reshape(len(xy), -1).T
@@ -119,7 +126,7 @@ def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
         xy=jnp.asarray(xy, jnp.float32),
         theta=jnp.asarray(poses[:, 2], jnp.float32),
         facing=jnp.asarray(np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], 1), jnp.float32),
-        nearest=jnp.asarray(np.where(np.isfinite(distance), nearest, -1), jnp.int32),
+        nearest=jnp.asarray(cells),
         shape=jnp.asarray(shape, jnp.int32),
         corner=jnp.asarray(low, jnp.float32),
         cell_m=jnp.asarray(cell_m, jnp.float32),
