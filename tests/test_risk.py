@@ -492,3 +492,30 @@ def test_risk_coverage_is_told_of_every_signal_by_its_own_answers():
     assert share[judge.NOW][[0, 49, 99]].tolist() == [0.0, 0.0, 0.5]
     assert share[judge.FINAL][[0, 49, 99]].tolist() == [1.0, 1.0, 0.5]
     assert share["tao"][[0, 49, 99]].tolist() == [0.0, 0.0, 0.5]
+
+
+def test_refined_weights_go_half_of_the_way_to_a_fit_of_stated_precision(rng):
+    """The fit in plain NumPy: its gradient is zero where a weight is above zero, else not below."""
+    z, is_wrong = rng.normal(size=(160, 2)), rng.random(160) < 0.4
+    z[:, 1] += 1.5 * is_wrong
+    split, own = fitted_on(z, is_wrong)
+    got = judge.refine(NOW, split, own, 0.05)
+    start = np.append(NOW.weight, NOW.bias)
+    fitted = start + 2.0 * (np.append(got.weight, got.bias) - start)
+    n = np.array([(~is_wrong).sum(), is_wrong.sum()])
+    counts = (np.minimum(40.0, n / 8.0) / n)[is_wrong.astype(int)]
+    gap = counts * (1.0 / (1.0 + np.exp(-(z @ fitted[:2] + fitted[2]))) - is_wrong)
+    pull = np.array([10.0, 10.0, 0.05]) * (fitted - start)
+    slope = np.append(gap @ z, gap.sum()) + pull
+    assert (fitted[:2] > 0).all()
+    np.testing.assert_allclose(slope, 0.0, atol=1e-3)
+    assert np.abs(pull).max() > 0.1
+
+
+def fitted_on(z, is_wrong):
+    """Return a calibration half whose standardised features are z, and its labels."""
+    raw = {name: NOW.mean[k] + NOW.scale[k] * z[:, k] for k, name in enumerate(NOW.columns)}
+    twice = {name: np.r_[values, values] for name, values in raw.items()}
+    label = np.full(2 * len(z), "in_map")
+    cut = labels.split_frames(twice, label, calibration_share=0.5, gap_frames=0)
+    return cut.calibration, Own(~is_wrong, is_wrong)
