@@ -137,9 +137,8 @@ def measure(route: Route, settings: ProgressConfig, seed: int, config: Config) -
     # The judge's own table, and one for what it does not know: rivals.
     others = {entry.name: entry.signal for entry in said}
     splits = _cut(judgement, others)
-    tested = judgement.answers.at(splits.test.frame)
     beside = tables.metrics_table(
-        others, judgement.label, splits, tested, config.audit, config.seed
+        others, judgement.label, splits, judgement.answers, config.audit, config.seed
     )
     rows = {}
     for table in (judgement.metrics, beside):

@@ -519,3 +519,22 @@ def fitted_on(z, is_wrong):
     label = np.full(2 * len(z), "in_map")
     cut = labels.split_frames(twice, label, calibration_share=0.5, gap_frames=0)
     return cut.calibration, Own(~is_wrong, is_wrong)
+
+
+def test_any_signal_is_judged_under_the_rule_of_the_verdicts():
+    rank = np.arange(100.0)
+    # Of the most trusted 60 answers none is wrong; one in two of the others.
+    own = Own((rank < 60) | (rank % 2 == 0), (rank >= 60) & (rank % 2 == 1))
+    row = judge.level_row(1e5 * rank, own, 1e5 * rank + 0.5, own, 0.05)
+    # 61 is wrong, and four times 1 in 61 + 4 is more than .05.
+    assert row["risk_level"] == 60e5
+    assert row["risk_recall"] == 60 / 80
+    assert row["risk_wrong"] == 0.0
+    loose = judge.level_row(rank, own, rank, own, 0.2)
+    assert loose["risk_level"] > 60
+    assert 0.0 < loose["risk_wrong"] < 0.2
+    never = Own(np.zeros(100, bool), np.ones(100, bool))
+    assert judge.level_row(rank, never, rank, own, 0.05) == {"risk_recall": 0.0}
+    blank = np.full(100, np.nan)
+    assert judge.level_row(blank, own, rank, own, 0.05) == {}
+    assert judge.level_row(rank, own, blank, own, 0.05) == {}

@@ -165,7 +165,7 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         else _outcomes(run.decisions["verdict"], label, answers.final),
         recall_curves=curves,
         verdicts=verdicts,
-        metrics=tables.metrics_table(measured, label, splits, tested, audit, config.seed),
+        metrics=tables.metrics_table(measured, label, splits, answers, audit, config.seed),
         calibration=numbers,
         accepted=tables.verdict_table(
             verdicts, tested, splits.test.frame, both, audit, config.seed

@@ -136,8 +136,8 @@ def metrics_table(
         signals: signal -> (t,) over the whole run, in the order of the rows.
         label: per frame.
         splits: of the same signals and of those `PROBABILITIES` that are to be measured.
-        answers: right or wrong, of the test frames.
-        config: thresholds and resamples.
+        answers: right or wrong, of all frames.
+        config: thresholds, the share that may be wrong, and resamples.
         seed: of the bootstrap.
     """
     test, n_test = splits.test, len(splits.test.frame)
@@ -167,7 +167,12 @@ def metrics_table(
             splits.calibration, name, config.sigmas, is_probability=is_probability
         )
         row |= operating_row(test, name, threshold, held)
-        row |= risk.risk_row(test.signals[name], answers.of(name))
+        own = answers.of(name)
+        seen, tested = (own.at(half.frame) for half in (splits.calibration, test))
+        row |= risk.risk_row(test.signals[name], tested)
+        row |= risk.level_row(
+            splits.calibration.signals[name], seen, test.signals[name], tested, config.max_wrong
+        )
         rows.append(row | (probability_row(test, name, held) if is_probability else {}))
     return from_rows("metrics", rows)
 
