@@ -115,7 +115,7 @@ fall = 1.0 - refined / np.maximum(closed, 1e-9)
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 3.6), layout="constrained")
 for chosen, colour, name in ((~is_off, "#1f5fa8", "in the map"), (is_off, "#d1495b", "off it")):
     left.loglog(closed[chosen], refined[chosen], ".", color=colour, markersize=3, label=name)
-    right.hist(100 * fall[chosen], np.linspace(0, 20, 41), color=colour, alpha=0.6, label=name)
+    right.hist(100 * fall[chosen], np.linspace(0, 5, 41), color=colour, alpha=0.6, label=name)
 left.axline((1.0, 1.0), (10.0, 10.0), color="0.6", linewidth=0.8)
 left.set(xlabel="closed form [m²]", ylabel="refined [m²]", title="tao_rank per frame, simulated")
 right.set(xlabel="fall of the cost [%]", ylabel="frames")

@@ -6,8 +6,10 @@ import pytest
 
 from taojax.audit import calibration, figures, protocol
 from taojax.audit.evaluate import evaluate
+from taojax.audit.glossary import about
 from taojax.audit.report import write_summary
-from taojax.audit.summary import PAPER_TABLE_2
+from taojax.audit.summary import PAPER_TABLE_2, mapout_table
+from taojax.audit.words import metric_row
 from taojax.detector import probability
 from taojax.tables import read_table
 
@@ -121,3 +123,13 @@ def test_the_paper_s_two_logistic_models_read_what_the_paper_offers():
     view, joint = calibration.LOGISTIC["single_view"], calibration.LOGISTIC["joint_features"]
     assert set(view) == {"top1", "margin", "entropy"}
     assert set(joint) - set(view) == {"velocity", "c_geom", "a_aniso", "h_proxy", "tao_rank"}
+
+
+def test_the_column_fused_is_not_called_the_verdicts(scenarios):
+    said = about("fused_far", "mapout")
+    assert "cannot abstain" in said
+    assert "Not the verdicts" in said
+    table = mapout_table(scenarios)
+    for row, name in enumerate(("default", "h3")):
+        judgement = scenarios[name].judgement
+        assert table["fused_far"][row] == metric_row(judgement, "fused")["far"]
