@@ -42,7 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     graph.add_argument("--out", type=Path, help="folder to make (default runs/graph/TIME)")
     graph.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     graph.add_argument("--only", default="", help="only data sets whose name contains this")
-    verbs.add_parser("notebooks", help="executes the notebooks and keeps their figures")
+    notebooks = verbs.add_parser("notebooks", help="executes the notebooks, keeps their figures")
+    notebooks.add_argument("--only", default="", help="only notebooks whose name contains this")
     refinement = verbs.add_parser("refinement", help="what the true Huber minimum buys and costs")
     refinement.add_argument("--quick", action="store_true", help="500 windows instead of 10,000")
     refinement.add_argument(
@@ -92,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.verb == "notebooks":
         from benchmarks import notebooks
 
-        notebooks.run()
+        notebooks.run(args.only)
         return 0
     out = args.out or Path("runs") / args.verb / time.strftime("%Y%m%d-%H%M%S")
     if out.exists() and any(out.iterdir()):

@@ -50,9 +50,13 @@ def pictures(notebook: NotebookNode) -> int:
     return sum("image/png" in output.get("data", {}) for output in outputs)
 
 
-def run() -> None:
-    """Execute every notebook and write it beside its source."""
-    for source in sorted(FOLDER.glob("*.py")):
+def run(only: str = "") -> None:
+    """Execute notebooks and write each beside its source.
+
+    Args:
+        only: part of a name; all where it is empty.
+    """
+    for source in sorted(path for path in FOLDER.glob("*.py") if only in path.stem):
         notebook = execute(read_source(source))
         path = source.with_suffix(".ipynb")
         write_atomically(path, nbformat.writes(notebook) + "\n")

@@ -19,8 +19,7 @@ import numpy as np
 
 from benchmarks import sets
 from benchmarks.entrants import rivals
-from taojax import detector
-from taojax.audit import calibration, labels, tables
+from taojax.audit import labels, tables
 from taojax.audit.judgement import Judgement, judge
 from taojax.audit.truth import read_truth
 from taojax.config import AuditConfig, Config
@@ -47,10 +46,6 @@ OTHER_ROW_M = 5.0
 RIVALS = ("topometric", "mht", "seqslam")
 """The systems that were made for routes; all others are in the leaderboard."""
 
-SINGLE_VIEW = {"top1_w5": "top1", "entropy": "entropy"}
-"""What the probability may read of one view: its similarity level without memory, and its
-entropy. The other parts are blanked, the fit is the same."""
-
 TITLES = {
     "top1": "top-1 score gate",
     "top1_w10": "its mean over 10 frames",
@@ -60,6 +55,7 @@ TITLES = {
     "tao_rank": "TAO as the paper writes it (`tao_rank`)",
     "tao": "**`tao`**",
     "single_view": "calibrated single view",
+    "joint_features": "calibrated joint features, as the paper writes them",
     "joint": "**calibrated joint (`probability_map_out`)**",
 }
 
@@ -67,7 +63,7 @@ PAPER = {
     "top1": (0.628, 0.710, 0.801),
     "tao_rank": (0.700, 0.746, 0.828),
     "single_view": (None, 0.517, None),
-    "joint": (None, 0.653, None),
+    "joint_features": (None, 0.653, None),
 }
 """Full AUC, held-out AUC and AP of the paper's Table 3; 304 of 1,000 queries map-out."""
 
@@ -117,14 +113,6 @@ def _cut(judgement: Judgement, signals: dict[str, np.ndarray]) -> labels.Splits:
     return labels.split_frames(signals, judgement.label, calibration_share=share, gap_frames=gap)
 
 
-def _single_view(judgement: Judgement) -> np.ndarray:
-    """Fit the calibrated probability again on what one view tells, the calibration half alone."""
-    seen = {name: np.zeros(len(judgement.label)) for name in calibration.DISTINCT}
-    seen |= {part: judgement.signals[column] for part, column in SINGLE_VIEW.items()}
-    recall = float(judgement.manifest["map_recall"])
-    return detector.probability(calibration.fit(_cut(judgement, seen).calibration, recall), seen)
-
-
 def measure(route: Route, settings: ProgressConfig, seed: int, config: Config) -> list[Row]:
     """Write, score and judge one route as `taojax audit` would.
 
@@ -146,19 +134,17 @@ def measure(route: Route, settings: ProgressConfig, seed: int, config: Config) -
         truth = read_truth(data / "truth", len(route.query_rows))
         judgement = judge(read_run(run), truth, config)
         said = rivals(sets.real(data, radii), lambda name: name in RIVALS)
-    # The judge's own table, and one for what it does not know: rivals, and the single view in the
-    # place of the probability.
+    # The judge's own table, and one for what it does not know: rivals.
     others = {entry.name: entry.signal for entry in said}
-    splits = _cut(judgement, others | {tables.FUSED: _single_view(judgement)})
-    tested = judgement.answers.at(splits.test.frame)
+    splits = _cut(judgement, others)
     beside = tables.metrics_table(
-        others, judgement.label, splits, tested, config.audit, config.seed
+        others, judgement.label, splits, judgement.answers, config.audit, config.seed
     )
     rows = {}
-    for table, fused in ((judgement.metrics, "joint"), (beside, "single_view")):
+    for table in (judgement.metrics, beside):
         for at, signal in enumerate(table["signal"]):
             row = {column: values[at] for column, values in table.items()}
-            rows[fused if signal == tables.FUSED else signal] = row
+            rows["joint" if signal == tables.FUSED else signal] = row
     n_anchors = settings.n_anchors or len(route.map_rows)
     own = {"n_anchors": n_anchors, "row_m": settings.row_m, "seed": seed}
     return [rows[method] | own | {"method": method} for method in TITLES]
@@ -231,7 +217,7 @@ def to_markdown(rows: Sequence[Row]) -> str:
         "Two stretches of the route are deleted from the map, one in each half of the queries. "
         "AP: map-out is the positive class. FAR and FRR: held-out half, at mean + 3 standard "
         "deviations of in-map calibration values; probabilities at the level that accepts 95 % "
-        "of them. Single view and joint are fitted on the calibration half and measured on the "
+        "of them. Calibrated models are fitted on the calibration half and measured on the "
         "other.\n",
         _unit(rows),
     ]

@@ -1,4 +1,8 @@
-"""The door between robot and judge: one folder, written once, sealed, read only if unbroken."""
+"""The door between robot and judge: one folder, written once, sealed, read only if unbroken.
+
+The seal is a hash without a key: it guards against accidents, such as a file that was edited, cut
+short or mixed up with another run's. It does not guard against cheats, who can seal anew.
+"""
 
 import dataclasses
 import hashlib

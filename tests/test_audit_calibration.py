@@ -136,3 +136,35 @@ def test_terms_are_told_from_the_mean_in_map_frame(rng):
     model = calibration.fit(inside)
     own = {name: values[inside.is_in] for name, values in inside.signals.items()}
     np.testing.assert_allclose(log_odds_terms(model, own).mean(axis=0), 0.0, atol=1e-12)
+
+
+def slope(model, split, start, precision):
+    """Return the gradient of what a fit minimises, in plain NumPy; zero at its minimum."""
+    x = np.stack([split.signals[name] for name in model.columns], axis=1)
+    z = (x - x.mean(axis=0)) / x.std(axis=0)
+    # The detector measures its terms from the mean in-map frame: told from the overall mean again.
+    shift = (model.mean - x.mean(axis=0)) / x.std(axis=0)
+    bias = model.bias - np.sum(shift * model.weight)
+    n = np.array([split.is_in.sum(), split.is_out.sum()])
+    counts = (np.minimum(40.0, n / 8.0) / n)[split.is_out.astype(int)]
+    gap = counts * (1.0 / (1.0 + np.exp(-(z @ model.weight + bias))) - split.is_out)
+    return np.append(gap @ z + precision * (model.weight - start), gap.sum() + 0.01 * bias)
+
+
+def test_the_weights_hold_to_the_prior_with_a_precision_of_ten(rng):
+    split = split_of(*frames(rng, 150, 100, shift=1.0))
+    start = np.array(list(calibration.prior(0.9).values()))
+    model = calibration.fit(split, 0.9)
+    np.testing.assert_allclose(slope(model, split, start, 10.0), 0.0, atol=1e-3)
+    assert np.abs(slope(model, split, start, 0.1)).max() > 0.1
+
+
+def test_a_plain_model_holds_to_zero_with_a_precision_of_one(rng):
+    signals, label = frames(rng, 150, 100, shift=1.0)
+    split = split_of(signals, label)
+    model = calibration.fit_plain(split, ("tao", "entropy"))
+    assert model.columns == ("tao", "entropy")
+    np.testing.assert_allclose(slope(model, split, np.zeros(2), 1.0), 0.0, atol=1e-3)
+    assert model.weight[0] > 0.5
+    assert abs(model.weight[1]) < 0.3
+    assert "2 signals, shrunk to zero" in model.note

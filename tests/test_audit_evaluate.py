@@ -63,9 +63,9 @@ def test_every_table_meets_its_spec(case):
     lengths = {name: len(next(iter(table.values()))) for name, table in tables.items()}
     n_signals = len(records.signal_names())
     assert lengths == {
-        "labels": 240, "verdicts": 240, "metrics": n_signals + 3, "recall": 3,
+        "labels": 240, "verdicts": 240, "metrics": n_signals + 5, "recall": 3,
         "micro": 2 * n_signals, "errors": 4, "verdict_table": 2,
-        "risk_coverage": 100 * (n_signals + 3),
+        "risk_coverage": 100 * (n_signals + 5),
     }  # fmt: skip
 
 
@@ -112,7 +112,11 @@ def test_the_probability_is_scored_on_the_test_split_alone(case):
         assert np.isnan(table[name][at])
     for name in ("auroc_test", "threshold", "far", "frr", "ece", "brier"):
         assert np.isfinite(table[name][at])
-    assert np.isnan(table["ece"][:at]).all()
+    # The paper's two logistic models stand before it, and are told like it.
+    assert table["signal"][at - 2 : at].tolist() == ["single_view", "joint_features"]
+    assert np.isfinite(table["ece"][at - 2 :]).all()
+    assert np.isnan(table["n_in"][at - 2 :]).all()
+    assert np.isnan(table["ece"][: at - 2]).all()
 
 
 def test_verdicts_cover_every_frame_and_warming_up_abstains(case):

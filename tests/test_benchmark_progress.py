@@ -45,14 +45,14 @@ def made(tmp_path_factory):
 def test_every_method_has_a_row_per_map_and_seed_and_one_at_another_unit(made):
     table = read_table(made[0] / "progress.csv", "progress")
     assert set(table["method"]) == set(progress.TITLES) - {"topometric", "seqslam"}
-    assert len(table["set"]) == 5 * 7
+    assert len(table["set"]) == 5 * 8
     assert sorted(set(table["n_anchors"])) == [70.0, 140.0]
-    assert (table["row_m"] == 5.0).sum() == 7
+    assert (table["row_m"] == 5.0).sum() == 8
 
 
 def test_what_is_fitted_is_measured_on_the_test_half_alone(made):
     table = read_table(made[0] / "progress.csv", "progress")
-    fitted = np.isin(list(table["method"]), ["single_view", "joint"])
+    fitted = np.isin(list(table["method"]), ["single_view", "joint_features", "joint"])
     assert np.isnan(table["auroc"][fitted]).all()
     assert np.isfinite(table["auroc"][~fitted]).all()
     assert np.isfinite(table["auroc_test"]).all()
@@ -77,7 +77,7 @@ def test_the_page_says_simulated_and_sets_the_paper_apart(made):
     assert "**simulated odometry**" in text
     assert "other data" in text
     assert ".628 | .710 | .801" in text
-    for method in ("top1", "mht", "tao_rank", "tao", "single_view", "joint"):
+    for method in ("top1", "mht", "tao_rank", "tao", "single_view", "joint_features"):
         assert text.count(progress.TITLES[method]) >= 2
 
 

@@ -114,7 +114,8 @@ def test_audit_leaves_every_file_of_the_contract(data_folder, tmp_path, capfd):
     assert any((out / "figures").glob("*.svg"))
     rows = (out / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows[1:]] == [
-        *signal_names(), "probability_wrong_now", "probability_wrong", "fused",
+        *signal_names(), "probability_wrong_now", "probability_wrong", "single_view",
+        "joint_features", "fused",
     ]  # fmt: skip
     assert "r_in_m = 3.0" in (out / "config.toml").read_text()
     page = (out / "report.html").read_text()

@@ -294,3 +294,23 @@ def test_one_hopeless_branch_does_not_disturb_its_neighbours(rng):
     assert np.isfinite(got.total).all()
     alone = cost(p, q, np.zeros(N))
     np.testing.assert_allclose(got.total[0], alone.total, rtol=1e-5)
+
+
+def test_a_second_fit_that_fixes_no_angle_is_not_taken():
+    """Three frames at one place are inside the mask, two far ones that fix the angle are not."""
+    p = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 0.0], [-10.0, 0.0], [0.0, 0.0]])
+    q = np.array([[0.0, 0.0], [0.0, 60.0], [0.0, 0.0], [0.0, -60.0], [0.0, 0.0]])
+    got = cost(p, q, settings=params(lam=0.0))
+    np.testing.assert_allclose(got.T_map_odom, [0.0, 0.0, np.pi / 2], atol=1e-5)
+    assert not got.is_degenerate
+    np.testing.assert_array_equal(got.is_inlier, [True, False, True, False, True])
+
+
+def test_a_frame_without_an_anchor_or_without_weight_is_no_inlier():
+    p = np.c_[np.arange(N) - N + 1.0, np.zeros(N)]
+    has, weight = np.arange(N) != 3, np.full(N, 1.0 / (N - 1))
+    weight[7] = 0.0
+    # Where an anchor is missing the place of the map's origin stands in, and p passes it.
+    got = cost(p, p, has=has, weight=weight)
+    want = has & (np.arange(N) != 7)
+    np.testing.assert_array_equal(got.is_inlier, want)

@@ -1,6 +1,7 @@
 """Spliced kidnap logs: what the generator promises, and the command on top of it."""
 
 import csv
+import dataclasses
 import itertools
 import json
 import os
@@ -19,6 +20,7 @@ from taojax.datasets.kidnap import (
     WINDOW_FRAMES,
     Plan,
     Source,
+    cut_rows,
     far_m,
     in_map,
     make_logs,
@@ -128,12 +130,44 @@ def test_calibration_logs_do_not_count_and_enough_others_are_made(logs):
     assert WINDOW_FRAMES == LEAST_FRAMES
 
 
+def test_no_threshold_has_seen_a_frame_that_it_is_tried_on(source, logs):
+    seen = {
+        split: set(np.concatenate([log.rows for log in logs if log.split == split]))
+        for split in ("calibration", "test")
+    }
+    assert min(map(len, seen.values())) >= PLAN.stretch[0]
+    assert not seen["calibration"] & seen["test"]
+    sides = cut_rows(source, PLAN)
+    for split, rows in seen.items():
+        assert rows <= set(np.flatnonzero(sides[split]))
+    np.testing.assert_array_equal(sides["calibration"] | sides["test"], in_map(source, PLAN.r_in_m))
+
+
+def test_long_recordings_give_a_fifth_to_thresholds_and_short_ones_more(source):
+    long = dataclasses.replace(source, query_poses=np.c_[np.arange(400), loop(400, 80.0)])
+    for drive, share in ((long, 0.2), (source, 1 / 3)):
+        sides = cut_rows(drive, PLAN)
+        assert sides["calibration"].mean() == pytest.approx(
+            share * in_map(drive, PLAN.r_in_m).mean(), abs=0.01
+        )
+
+
+def test_a_recording_with_one_place_for_thresholds_and_none_for_trials_is_refused():
+    # A straight drive that is too short to be carried far away within one half of it.
+    places = np.c_[np.linspace(0.0, 100.0, 120), np.zeros((120, 2))]
+    poses = np.c_[np.arange(120.0), places]
+    drive = dataclasses.replace(small_source(), map_poses=poses, query_poses=poses)
+    assert cut_rows(drive, Plan(5, stretch=(20, 25)))
+    with pytest.raises(InputError, match="not apart from those that thresholds are frozen on"):
+        cut_rows(drive, Plan(5, stretch=(40, 45)))
+
+
 def test_the_same_seed_gives_the_same_logs(source, logs):
     again, other = make_logs(source, PLAN, seed=5), make_logs(source, PLAN, seed=6)
     for a, b in zip(logs, again, strict=True):
         np.testing.assert_array_equal(a.rows, b.rows)
         np.testing.assert_array_equal(a.odometry, b.odometry)
-    assert not np.array_equal(logs[0].rows, other[0].rows)
+    assert not np.array_equal(logs[-1].rows, other[-1].rows)
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -11,6 +11,7 @@ from judged import evaluated, seal
 
 import taojax
 from taojax import records
+from taojax.audit.calibration import LOGISTIC
 from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.errors import InputError
 from taojax.results import SUMMARIES
@@ -45,7 +46,7 @@ def test_a_judged_run_comes_back_whole(judged):
         np.testing.assert_allclose(run.signals[name], judgement.signals[name], rtol=1e-8)
     np.testing.assert_array_equal(run.labels["label"], judgement.label)
     np.testing.assert_array_equal(run.verdicts["verdict"], judgement.verdicts["verdict"])
-    assert list(run.metrics.index) == [*records.signal_names(), *ANSWERED, "fused"]
+    assert list(run.metrics.index) == [*records.signal_names(), *ANSWERED, *LOGISTIC, "fused"]
     at = list(judgement.metrics["signal"]).index("tao")
     assert run.metrics.loc["tao", "auroc"] == pytest.approx(judgement.metrics["auroc"][at])
     assert np.isnan(run.metrics.loc["fused", "n_in"])

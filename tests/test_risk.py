@@ -492,3 +492,49 @@ def test_risk_coverage_is_told_of_every_signal_by_its_own_answers():
     assert share[judge.NOW][[0, 49, 99]].tolist() == [0.0, 0.0, 0.5]
     assert share[judge.FINAL][[0, 49, 99]].tolist() == [1.0, 1.0, 0.5]
     assert share["tao"][[0, 49, 99]].tolist() == [0.0, 0.0, 0.5]
+
+
+def test_refined_weights_go_half_of_the_way_to_a_fit_of_stated_precision(rng):
+    """The fit in plain NumPy: its gradient is zero where a weight is above zero, else not below."""
+    z, is_wrong = rng.normal(size=(160, 2)), rng.random(160) < 0.4
+    z[:, 1] += 1.5 * is_wrong
+    split, own = fitted_on(z, is_wrong)
+    got = judge.refine(NOW, split, own, 0.05)
+    start = np.append(NOW.weight, NOW.bias)
+    fitted = start + 2.0 * (np.append(got.weight, got.bias) - start)
+    n = np.array([(~is_wrong).sum(), is_wrong.sum()])
+    counts = (np.minimum(40.0, n / 8.0) / n)[is_wrong.astype(int)]
+    gap = counts * (1.0 / (1.0 + np.exp(-(z @ fitted[:2] + fitted[2]))) - is_wrong)
+    pull = np.array([10.0, 10.0, 0.05]) * (fitted - start)
+    slope = np.append(gap @ z, gap.sum()) + pull
+    assert (fitted[:2] > 0).all()
+    np.testing.assert_allclose(slope, 0.0, atol=1e-3)
+    assert np.abs(pull).max() > 0.1
+
+
+def fitted_on(z, is_wrong):
+    """Return a calibration half whose standardised features are z, and its labels."""
+    raw = {name: NOW.mean[k] + NOW.scale[k] * z[:, k] for k, name in enumerate(NOW.columns)}
+    twice = {name: np.r_[values, values] for name, values in raw.items()}
+    label = np.full(2 * len(z), "in_map")
+    cut = labels.split_frames(twice, label, calibration_share=0.5, gap_frames=0)
+    return cut.calibration, Own(~is_wrong, is_wrong)
+
+
+def test_any_signal_is_judged_under_the_rule_of_the_verdicts():
+    rank = np.arange(100.0)
+    # Of the most trusted 60 answers none is wrong; one in two of the others.
+    own = Own((rank < 60) | (rank % 2 == 0), (rank >= 60) & (rank % 2 == 1))
+    row = judge.level_row(1e5 * rank, own, 1e5 * rank + 0.5, own, 0.05)
+    # 61 is wrong, and four times 1 in 61 + 4 is more than .05.
+    assert row["risk_level"] == 60e5
+    assert row["risk_recall"] == 60 / 80
+    assert row["risk_wrong"] == 0.0
+    loose = judge.level_row(rank, own, rank, own, 0.2)
+    assert loose["risk_level"] > 60
+    assert 0.0 < loose["risk_wrong"] < 0.2
+    never = Own(np.zeros(100, bool), np.ones(100, bool))
+    assert judge.level_row(rank, never, rank, own, 0.05) == {"risk_recall": 0.0}
+    blank = np.full(100, np.nan)
+    assert judge.level_row(blank, own, rank, own, 0.05) == {}
+    assert judge.level_row(rank, own, blank, own, 0.05) == {}

@@ -1,4 +1,8 @@
-"""Attempts to fool the judge, or to show the robot the truth: each fails, and is named."""
+"""Attempts to fool the judge, or to show the robot the truth: each fails, and is named.
+
+Of accidents, that is, and clumsy cheats: who seals a changed run anew is not caught, for the seal
+has no key.
+"""
 
 import io
 import json

@@ -1,5 +1,6 @@
 """From signals to thresholds and probabilities; everything is fitted on the calibration split."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,20 @@ DISTINCT = {
 }
 """The same for a map that tells all its places apart: there a filter that adds up the answers of
 every frame, and a list that agrees with itself, can be believed."""
+
+VIEW = ("top1", "margin", "entropy")
+"""What one view tells: its best similarity, and how the list stands out (paper, section 3.3)."""
+
+LOGISTIC = {
+    "single_view": VIEW,
+    "joint_features": (*VIEW, "velocity", "c_geom", "a_aniso", "h_proxy", "tao_rank"),
+}
+"""Row of metrics.csv -> features of a plain logistic model, the paper's two: of the frontend, and
+of the frontend and what Eq. 1 and its alignment say. Given to `fit` besides its own six signals,
+margin and diagnostics change no test AUROC by more than .001 in default, h3 and h4."""
+
+PLAIN_PRECISION = 1.0
+"""How firmly the weights of these two hold to zero, scikit-learn's habit; the bias as below."""
 
 PRIOR_PRECISION = 10.0
 """How firmly the weights hold to the prior; one labelled effective frame weighs about 1/4."""
@@ -69,13 +84,10 @@ def prior(map_recall: float) -> dict[str, float]:
     return {name: (1.0 - share) * BLURRED[name] + share * DISTINCT[name] for name in DISTINCT}
 
 
-def _note(n_in: int, n_out: int) -> str:
+def _note(what: str, n_in: int, n_out: int) -> str:
     counts = f"{n_in} in-map and {n_out} map-out calibration frames"
     if min(n_in, n_out) >= LEAST_PER_CLASS:
-        return (
-            f"The probability is a logistic model over {len(DISTINCT)} signals, shrunk to a "
-            f"prior that the map alone sets, and fitted on {counts}."
-        )
+        return f"The probability is a logistic model over {what}, and fitted on {counts}."
     return (
         f"{FALLBACK}, because there are only {counts} and two classes of at "
         f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the prior's, so "
@@ -137,18 +149,50 @@ def fit(
 ) -> Detector:
     """Fit the probability of being map-out: logistic, shrunk to a prior made from the map alone.
 
-    Location and scale of each signal come from all calibration frames, labelled or not; with one
-    class, or a handful of frames, the prior decides.
-
     Args:
         calibration: frames that may be fitted on; grey ones give scale but no label.
         map_recall: how far the map tells its own places apart; sealed in the run's manifest.
 
     Returns:
+        The detector, as `fit_columns` gives it.
+    """
+    weights = prior(map_recall)
+    what = f"{len(weights)} signals, shrunk to a prior that the map alone sets"
+    return fit_columns(calibration, weights, PRIOR_PRECISION, what)
+
+
+def fit_plain(calibration: CalibrationSplit, columns: Sequence[str]) -> Detector:
+    """Fit a plain logistic model of being map-out, as the paper's Table 3 has two of.
+
+    Args:
+        calibration: frames that may be fitted on, with these signals.
+        columns: signals that it may read, as in `LOGISTIC`.
+
+    Returns:
+        The detector, as `fit_columns` gives it; no prior but zero.
+    """
+    what = f"{len(columns)} signals, shrunk to zero"
+    return fit_columns(calibration, dict.fromkeys(columns, 0.0), PLAIN_PRECISION, what)
+
+
+def fit_columns(
+    calibration: CalibrationSplit, weights: Mapping[str, float], precision: float, what: str
+) -> Detector:
+    """Fit a logistic model of being map-out over some signals.
+
+    Location and scale of each signal come from all calibration frames, labelled or not; with one
+    class, or a handful of frames, the prior decides.
+
+    Args:
+        calibration: frames that may be fitted on; grey ones give scale but no label.
+        weights: signal -> log odds per standard deviation before any label is seen.
+        precision: how firmly the weights hold to these.
+        what: the model in words, for its note.
+
+    Returns:
         The detector. Its threshold is the level that accepts 95 % of the in-map calibration
         frames; NaN where there is none.
     """
-    weights = prior(map_recall)
     x = np.stack([np.asarray(calibration.signals[name], float) for name in weights], axis=1)
     mean, spread = x.mean(axis=0), x.std(axis=0)
     scale = np.where(spread > _TINY, spread, 1.0)
@@ -159,7 +203,7 @@ def fit(
         is_out,
         effective_weights(is_out),
         start=np.append(list(weights.values()), 0.0),
-        precision=np.append(np.full(len(weights), PRIOR_PRECISION), BIAS_PRECISION),
+        precision=np.append(np.full(len(weights), precision), BIAS_PRECISION),
     )
     # Told from the mean in-map frame, a term says what makes a frame unlike the places it knows.
     level = x[calibration.is_in].mean(axis=0) if calibration.is_in.any() else mean
@@ -170,7 +214,7 @@ def fit(
         weight=best[:-1],
         bias=float(best[-1] + np.sum((level - mean) / scale * best[:-1])),
         threshold=float("nan"),
-        note=_note(int((~is_out).sum()), int(is_out.sum())),
+        note=_note(what, int((~is_out).sum()), int(is_out.sum())),
     )
     inside = probability(detector, calibration.signals)[calibration.is_in]
     return detector._replace(threshold=accepting_level(inside))

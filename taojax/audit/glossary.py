@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
+from taojax.audit.calibration import LOGISTIC
 from taojax.specs import load_spec
 
 _ACCEPTED = "share of the map-out test frames with the verdict accept; abstaining accepts nothing"
@@ -82,6 +83,11 @@ WRONG = (
     "truth"
 )
 
+PLAIN = (
+    "the paper's calibrated logistic model: probability of being off the map from {}; fitted on "
+    "the calibration half"
+)
+
 FUSED = "calibrated probability of being off the map, from the sealed signals of the frame alone"
 
 
@@ -97,7 +103,8 @@ def names_of_signals() -> Mapping[str, str]:
         "probability_wrong_now": WRONG.format("causal"),
         "probability_wrong": WRONG.format("final"),
     }
-    return found | own | {"fused": FUSED}
+    plain = {name: PLAIN.format(", ".join(columns)) for name, columns in LOGISTIC.items()}
+    return found | own | plain | {"fused": FUSED}
 
 
 def names_of_tables(specs: Sequence[str]) -> dict[str, str]:

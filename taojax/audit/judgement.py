@@ -10,7 +10,7 @@ from taojax.audit import calibration, labels, metrics, risk, tables
 from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
 from taojax.config import Config
-from taojax.detector import Detector
+from taojax.detector import Detector, probability
 from taojax.records import Run, map_of, signal_names
 from taojax.risk import Calibration, for_run, shipped
 from taojax.verdicts import decide
@@ -39,7 +39,7 @@ class Judgement(NamedTuple):
 
     label: Shaped[np.ndarray, " t"]
     splits: labels.Splits
-    """Of the signals and of `fused`."""
+    """Of the signals and of the fitted probabilities."""
 
     outcome: Shaped[np.ndarray, " t"]
     """Key of `plots.OUTCOMES` per frame."""
@@ -62,6 +62,9 @@ class Judgement(NamedTuple):
 
     detector: Detector
     """The frozen numbers behind the probability of being off the map."""
+
+    logistic: dict[str, Detector]
+    """The same of the paper's two logistic models."""
 
     calibration: Calibration
     """All frozen numbers, those behind the verdicts among them."""
@@ -123,11 +126,16 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         for pooled, own in ((base.now, half.now), (base.final, half.final))
     ]
     model = calibration.fit(first, recall)
+    logistic = {
+        name: calibration.fit_plain(first, columns)
+        for name, columns in calibration.LOGISTIC.items()
+    }
     numbers = Calibration(refined[0], refined[1], model, map_of(run.manifest))
     verdicts = decide(numbers, run.signals, run.delayed)
     # Cut again with the probabilities beside the signals: only the splitter makes the two tables.
     measured = signals | {name: verdicts[name] for name in (risk.NOW, risk.FINAL)}
-    with_fused = measured | {tables.FUSED: verdicts["probability_map_out"]}
+    with_fused = measured | {name: probability(plain, signals) for name, plain in logistic.items()}
+    with_fused[tables.FUSED] = verdicts["probability_map_out"]
     splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)
     tested, both = answers.at(splits.test.frame), {"now": refined[0], "final": refined[1]}
 
@@ -157,7 +165,7 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         else _outcomes(run.decisions["verdict"], label, answers.final),
         recall_curves=curves,
         verdicts=verdicts,
-        metrics=tables.metrics_table(measured, label, splits, tested, audit, config.seed),
+        metrics=tables.metrics_table(measured, label, splits, answers, audit, config.seed),
         calibration=numbers,
         accepted=tables.verdict_table(
             verdicts, tested, splits.test.frame, both, audit, config.seed
@@ -169,6 +177,7 @@ def judge(run: Run, truth: Truth, config: Config) -> Judgement:
         promise=tables.promised(splits.calibration, "tao", audit),
         errors=tables.errors_table(error, groups, audit.wrong_m),
         detector=model,
+        logistic=logistic,
         clock_gap_s=float(np.max(np.abs(truth.t_s - run.signals["t_s"]))),
     )
 

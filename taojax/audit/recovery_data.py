@@ -131,8 +131,10 @@ def load(part: Part, rules: Rules, *, seen: bool = False) -> Judged:
     map_m = np.stack([run.map_poses["x_m"], run.map_poses["y_m"]], axis=1)
     if part.kind == "recorded":
         drift, stretch = np.full(n, RECORDED, dtype=object), np.zeros(n, int)
-        may_fit, length = np.arange(n) < n // 2, n
-        events = reentries(truth.xy_m, map_m, rules.r_in_m, rules.stay_frames)
+        events, length = reentries(truth.xy_m, map_m, rules.r_in_m, rules.stay_frames), n
+        may_fit = np.full(n, True)
+        for event in events:
+            may_fit[event.start : event.end] = False
     else:
         trials = read_trials(part.truth, n)
         length = trials.log_frames

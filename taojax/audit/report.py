@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taojax.audit import figures, scenario_figures, summary, tables
+from taojax.audit import figures, protocol, scenario_figures, summary, tables
 from taojax.audit.counts import VERDICT_FAR, VERDICT_FRR, counts_table, rates_of, rates_table
 from taojax.audit.figures import Picture
 from taojax.audit.glossary import about, glossary, names_of_signals, names_of_tables
@@ -131,8 +131,9 @@ def _first_grids(judgement: Judgement) -> list[Grid]:
 
 def _run_grids(judgement: Judgement) -> list[Grid]:
     table = judgement.metrics
-    runtime = {name: values[:-1] for name, values in table.items()}
-    probability = {name: values[-1:] for name, values in table.items()}
+    is_fitted = np.isin(table["signal"].astype(str), tables.PROBABILITIES)
+    runtime = {name: values[~is_fitted] for name, values in table.items()}
+    probability = {name: values[is_fitted] for name, values in table.items()}
     scores = ("signal", "n_in_test", "n_out_test", "ece", "brier")
     conformal = grid("conformal", judgement.conformal, title="Promised false acceptance rate")
     return [
@@ -143,7 +144,7 @@ def _run_grids(judgement: Judgement) -> list[Grid]:
         _main("Separation on the test split", table, _TEST),
         conformal._replace(main=MAIN),
         *_micro_grids(judgement.micro),
-        grid("metrics", probability, title="Calibrated probability", columns=scores),
+        grid("metrics", probability, title="Calibrated probabilities", columns=scores),
     ]
 
 
@@ -225,6 +226,18 @@ def _mapout_columns(key: str) -> tuple[str, ...]:
     return ("scenario", "map_out_frames", *measured, *ours)
 
 
+def _frozen_grids(frozen: tables.Table) -> list[Grid]:
+    """Return one frozen set beside each scenario's own; nothing where both are one."""
+    if not len(frozen["signal"]):
+        return []
+    columns = (
+        "scenario", "signal", "threshold", "far", "frr", "once_on", "once_threshold", "once_far",
+        "once_frr", "paper_far",
+    )  # fmt: skip
+    title = "Per scenario (far, frr) and one frozen set, as in the paper (once_*)"
+    return [grid("frozen", frozen, title=title, note=_NOT_OURS, columns=columns)]
+
+
 def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
     cards = []
     for name, done in summary.cut_maps(scenarios).items():
@@ -256,7 +269,8 @@ def write_summary(
         InputError: a file cannot be written.
     """
     base = scenarios.get(summary.WHOLE, next(iter(scenarios.values())))
-    words = tuple(_summary_words(scenarios, base))
+    frozen = protocol.frozen_table(scenarios)
+    words = (*_summary_words(scenarios, base), *protocol.frozen_words(frozen))
     mapout, recall, micro = (
         summary.mapout_table(scenarios), base.judgement.recall, base.judgement.micro,
     )  # fmt: skip
@@ -277,7 +291,7 @@ def write_summary(
         words=glossary(),
         terms={
             "Signals": names_of_signals(),
-            "Columns of the tables": names_of_tables(("mapout", "recall", "micro")),
+            "Columns of the tables": names_of_tables(("mapout", "frozen", "recall", "micro")),
         },
         cards=_summary_cards(scenarios),
         grids=[
@@ -285,6 +299,7 @@ def write_summary(
                  note=_NOT_OURS, columns=_mapout_columns("auroc")),
             grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: FAR",
                  note=_NOT_OURS, columns=_mapout_columns("far")),
+            *_frozen_grids(frozen),
             grid("recall", recall, title="Answerability and recall, map not cut"),
             grid("recall", summary.paper_recall_table(), title="The paper's Table 1",
                  note="Printed for comparison.")._replace(source="the paper"),
@@ -300,7 +315,9 @@ def write_summary(
         "report.html": render(page),
         "manifest.json": json.dumps(manifest, indent=2) + "\n",
     }
-    for name, table in (("mapout", mapout), ("recall", recall), ("micro", micro)):
+    for name, table in (
+        ("mapout", mapout), ("frozen", frozen), ("recall", recall), ("micro", micro),
+    ):  # fmt: skip
         files |= tables.as_files(name, table)
     for drawn in pictures:
         files |= figures.as_files(drawn)

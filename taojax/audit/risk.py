@@ -53,6 +53,10 @@ class Own(NamedTuple):
     is_wrong: Bool[np.ndarray, " n"]
     """Farther than wrong_m from the truth."""
 
+    def at(self, frames: np.ndarray) -> "Own":
+        """Return the labels of some frames."""
+        return Own(self.is_right[frames], self.is_wrong[frames])
+
 
 class Answers(NamedTuple):
     """Right or wrong, now and finally."""
@@ -66,7 +70,7 @@ class Answers(NamedTuple):
 
     def at(self, frames: np.ndarray) -> "Answers":
         """Return the labels of some frames."""
-        return Answers(*(Own(*(part[frames] for part in own)) for own in self))
+        return Answers(self.now.at(frames), self.final.at(frames))
 
 
 FINAL, NOW = "probability_wrong", "probability_wrong_now"
@@ -256,6 +260,39 @@ def risk_row(signal: Float[np.ndarray, " n"], own: Own) -> dict[str, float]:
         for name, precision in (("recall_at_p95", 0.95), ("recall_at_p99", 0.99)):
             keeps = is_last & (right >= precision * (wrong + right))
             row[name] = float(right[keeps].max() / right[-1]) if keeps.any() else 0.0
+    return row
+
+
+def level_row(
+    seen: Float[np.ndarray, " c"],
+    own_seen: Own,
+    tested: Float[np.ndarray, " n"],
+    own_tested: Own,
+    max_wrong: float,
+) -> dict[str, float]:
+    """Return what any signal accepts under the rule that sets the verdicts' level.
+
+    Args:
+        seen: signal of the calibration half; larger = less trusted.
+        own_seen: right or wrong, of its answers.
+        tested: signal of the test half.
+        own_tested: right or wrong, of its answers.
+        max_wrong: share of the accepted answers that may be wrong.
+
+    Returns:
+        The level, the share of the right test answers that it accepts, and of the accepted ones
+        that are wrong; no level where nothing may be accepted, and no share of nothing.
+    """
+    if np.isnan(seen).any() or np.isnan(tested).any():
+        return {}
+    level = checked_level(seen, own_seen, max_wrong, np.inf)
+    accepted = tested <= level
+    n_right, n_wrong = ((accepted & part).sum() for part in own_tested)
+    row = {"risk_level": level} if np.isfinite(level) else {}
+    if own_tested.is_right.any():
+        row["risk_recall"] = float(n_right / own_tested.is_right.sum())
+    if n_right + n_wrong:
+        row["risk_wrong"] = float(n_wrong / (n_right + n_wrong))
     return row
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from taojax.audit.calibration import LOGISTIC
 from taojax.audit.glossary import names_of_signals
 from taojax.audit.judgement import Judgement
 from taojax.audit.risk import FINAL, NOW
@@ -72,10 +73,12 @@ def _model(judgement: Judgement, names: list[str]) -> dict[str, Any]:
 
 
 def _signals(judgement: Judgement) -> list[dict[str, Any]]:
-    """Return name, unit, meaning and frozen threshold of every signal."""
+    """Return name, unit, meaning and frozen threshold of every signal and of our probabilities."""
     specs = {c["name"]: c for c in load_spec("signals")["columns"] if c.get("signal")}
     table, titles, found = judgement.metrics, names_of_signals(), []
     for name, threshold in zip(table["signal"], table["threshold"], strict=True):
+        if name in LOGISTIC:
+            continue
         spec = specs.get(str(name), {"about": titles[str(name)]})
         found.append(
             {

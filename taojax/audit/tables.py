@@ -17,6 +17,9 @@ from taojax.verdicts import plain
 
 NAN = float("nan")
 FUSED = "fused"
+PROBABILITIES = (*calibration.LOGISTIC, FUSED)
+"""Fitted models of being off the map: rows of metrics.csv that are told of the test half alone."""
+
 RADII_M = (2.5, 5.0, 10.0)
 """The radii of the paper's Table 1."""
 
@@ -96,10 +99,12 @@ def operating_row(
     return row
 
 
-def probability_row(test: TestSplit, weights: Float[np.ndarray, "b n"]) -> dict[str, float]:
-    """Return ECE and Brier score of the column `fused`, with their intervals."""
+def probability_row(
+    test: TestSplit, name: str, weights: Float[np.ndarray, "b n"]
+) -> dict[str, float]:
+    """Return ECE and Brier score of a fitted probability, with their intervals."""
     known = test.is_in | test.is_out
-    probability, is_out = test.signals[FUSED][known], test.is_out[known]
+    probability, is_out = test.signals[name][known], test.is_out[known]
     if not known.any() or np.isnan(probability).any():
         return {}
     once, drawn = np.ones((1, int(known.sum()))), weights[:, known]
@@ -125,14 +130,14 @@ def metrics_table(
     config: AuditConfig,
     seed: int,
 ) -> Table:
-    """Measure every signal, then the probability.
+    """Measure every signal, then the fitted probabilities.
 
     Args:
         signals: signal -> (t,) over the whole run, in the order of the rows.
         label: per frame.
-        splits: of the same signals and of `fused`.
-        answers: right or wrong, of the test frames.
-        config: thresholds and resamples.
+        splits: of the same signals and of those `PROBABILITIES` that are to be measured.
+        answers: right or wrong, of all frames.
+        config: thresholds, the share that may be wrong, and resamples.
         seed: of the bootstrap.
     """
     test, n_test = splits.test, len(splits.test.frame)
@@ -142,10 +147,12 @@ def metrics_table(
     n_in, n_out = float((label == "in_map").sum()), float((label == "map_out").sum())
     prevalence = n_out / (n_in + n_out) if n_in + n_out else NAN
     rows = []
-    for name in (*signals, FUSED):
+    probabilities = [name for name in PROBABILITIES if name in test.signals]
+    for name in (*signals, *probabilities):
+        is_probability = name in probabilities
         row: dict[str, Any] = {"signal": name} | _counts(test, "_test")
         row["n_exits"] = float(len(metrics.find_exits(test.label).first))
-        if name != FUSED:
+        if not is_probability:
             row |= {"n_in": n_in, "n_out": n_out, "prevalence": prevalence}
             row |= separation_row(
                 np.asarray(signals[name], dtype=float)[known], (label == "map_out")[known],
@@ -157,11 +164,16 @@ def metrics_table(
                 values, test.is_out[known_test], held[:, known_test], suffix="_test"
             )
         threshold = calibration.sigma_threshold(
-            splits.calibration, name, config.sigmas, is_probability=name == FUSED
+            splits.calibration, name, config.sigmas, is_probability=is_probability
         )
         row |= operating_row(test, name, threshold, held)
-        row |= risk.risk_row(test.signals[name], answers.of(name))
-        rows.append(row | (probability_row(test, held) if name == FUSED else {}))
+        own = answers.of(name)
+        seen, tested = (own.at(half.frame) for half in (splits.calibration, test))
+        row |= risk.risk_row(test.signals[name], tested)
+        row |= risk.level_row(
+            splits.calibration.signals[name], seen, test.signals[name], tested, config.max_wrong
+        )
+        rows.append(row | (probability_row(test, name, held) if is_probability else {}))
     return from_rows("metrics", rows)
 
 

@@ -22,7 +22,7 @@ _JOIN_FRAMES = 5  # wrong acceptances this close together are told as one stretc
 _MOST_STRETCHES = 3
 MAIN = (
     "top1", "top1_w10", "velocity", "tao_rank", "tao", "probability_wrong_now", "probability_wrong",
-    "fused",
+    "single_view", "joint_features", "fused",
 )  # fmt: skip
 """Signals that are told first; the others stand in the files."""
 

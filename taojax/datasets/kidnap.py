@@ -1,9 +1,9 @@
 """Splices kidnap logs: the robot is carried elsewhere, and its odometry does not notice.
 
 A log is a row of stretches, each a run of consecutive frames that really followed one another in
-the source. Into the first frame of a stretch leads the motion that belonged to that frame: the
-robot believes that it drove on. Views are those of the source; odometry is the true motion plus
-simulated drift.
+the source. Logs for thresholds and logs whose kidnaps count are spliced from other frames. Into
+the first frame of a stretch leads the motion that belonged to that frame: the robot believes that
+it drove on. Views are those of the source; odometry is the true motion plus simulated drift.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,8 @@ from taojax.datasets.trajectory import motions
 from taojax.errors import InputError
 
 __all__ = [
-    "LEVELS", "Drift", "Log", "Plan", "Source", "in_map", "make_logs", "noisy_odometry", "splice",
+    "LEVELS", "Drift", "Log", "Plan", "Source", "cut_rows", "in_map", "make_logs",
+    "noisy_odometry", "splice",
 ]  # fmt: skip
 
 TRIAL_FRAMES = 160
@@ -34,6 +35,11 @@ FAR_SHARE = 0.25
 
 CALIBRATION_EVERY = 5
 """Every so many logs one is set apart for thresholds; its kidnaps are not counted."""
+
+PARTS = (10, 8, 6, 4)
+"""The in-map frames are cut into so many equal runs, and calibration logs are spliced from two of
+them, half of a drive apart; fewer and longer ones where the first number leaves a side without a
+stretch that is long enough and far enough away."""
 
 
 class Drift(NamedTuple):
@@ -178,6 +184,53 @@ def _room(inside: Bool[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
     return room[:-1]
 
 
+def _goes_on(source: Source, room: Int[np.ndarray, " t"], plan: Plan) -> bool:
+    """Tell whether from every end of a stretch some other one lies far enough away."""
+    place, low = source.query_poses[:, 1:3], plan.stretch[0]
+    starts = place[room >= low]
+    behind = np.zeros(len(room), int)
+    for i in range(1, len(room)):
+        behind[i] = behind[i - 1] + 1 if room[i] else 0
+    ends, least_m = place[behind >= low], far_m(source)
+    return len(starts) > 0 and all(
+        np.hypot(*(starts - end[None]).T).max() >= least_m for end in ends
+    )
+
+
+def cut_rows(source: Source, plan: Plan) -> dict[str, Bool[np.ndarray, " t"]]:
+    """Cut the in-map frames in two, so that no threshold has seen a frame that it is tried on.
+
+    Args:
+        source: where logs are spliced from.
+        plan: lengths and radius.
+
+    Returns:
+        `calibration` and `test` -> the frames that such logs may hold; none is in both.
+
+    Raises:
+        InputError: no cut of `PARTS` leaves stretches on both sides.
+    """
+    inside = in_map(source, plan.r_in_m)
+    number = np.cumsum(inside) - 1
+    for parts in PARTS:
+        part = number * parts // max(1, int(inside.sum()))
+        for first in range(parts // 2):
+            chosen = inside & ((part == first) | (part == first + parts // 2))
+            sides = {"calibration": chosen, "test": inside & ~chosen}
+            if all(_goes_on(source, _room(side), plan) for side in sides.values()):
+                return sides
+    raise InputError(_too_small(source, plan))
+
+
+def _too_small(source: Source, plan: Plan) -> str:
+    return (
+        f"no stretch of {plan.stretch[0]} in-map frames lies {far_m(source):.0f} m or more from the"
+        f" one before (in-map: truth within {plan.r_in_m:g} m of a map pose), or not apart from"
+        " those that thresholds are frozen on; give a longer recording that visits more of its"
+        " map, or a larger --r-in"
+    )
+
+
 def splice(
     source: Source, room: Int[np.ndarray, " t"], plan: Plan, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " k"]]:
@@ -185,7 +238,7 @@ def splice(
 
     Args:
         source: where from.
-        room: consecutive in-map frames that begin at each frame of it.
+        room: consecutive frames that begin at each frame of it and may be taken.
         plan: lengths and radius.
         rng: draws lengths and places.
 
@@ -204,11 +257,7 @@ def splice(
             is_far = np.hypot(*(place - place[rows[-1]][None]).T) >= least_m
         longest = int(min(high, room[is_far].max(initial=0)))
         if longest < low:
-            raise InputError(
-                f"no stretch of {low} in-map frames lies {least_m:.0f} m or more from the one"
-                f" before (in-map: truth within {plan.r_in_m:g} m of a map pose); give a longer"
-                " recording that visits more of its map, or a larger --r-in"
-            )
+            raise InputError(_too_small(source, plan))
         length = int(rng.integers(low, longest + 1))
         start = int(rng.choice(np.flatnonzero(is_far & (room >= length))))
         if len(rows):
@@ -231,21 +280,22 @@ def make_logs(
         levels: keys of `LEVELS`.
 
     Returns:
-        The logs. Of every five per level the first is for calibration; jumps in the last
-        `WINDOW_FRAMES` frames are in `kidnaps` but do not count.
+        The logs. Of every five per level the first is for calibration, and shares no frame of the
+        source with the others; jumps in the last `WINDOW_FRAMES` frames are in `kidnaps` but do
+        not count.
 
     Raises:
         InputError: the source has too few in-map stretches.
     """
     rng = np.random.default_rng([seed, 1])
     true_motion, unit_m = motions(source.query_poses[:, 1:]), window_m(source)
-    room = _room(in_map(source, plan.r_in_m))
+    rooms = {split: _room(side) for split, side in cut_rows(source, plan).items()}
     length = np.hypot(true_motion[:, 0], true_motion[:, 1])
     logs: list[Log] = []
     n_counted, number = 0, 0
     while n_counted < plan.n_trials:
-        rows, jumps = splice(source, room, plan, rng)
         split = "test" if number % CALIBRATION_EVERY else "calibration"
+        rows, jumps = splice(source, rooms[split], plan, rng)
         for level in levels:
             odometry = noisy_odometry(true_motion[rows], LEVELS[level], unit_m, rng)
             middle = sum(plan.stretch) // 2
