@@ -6,6 +6,7 @@ matrix. There are no comments and no FIX lines, which some readers refuse.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from taojax.tables import MOTION, POSE, read_frames, read_table, stacked
 __all__ = [
     "Graph",
     "Verdicts",
+    "as_verdicts",
     "between",
     "build_graph",
     "compose",
@@ -149,8 +151,19 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
         path, numbers, table = folder / "decisions.csv", folder / "detector.toml", run.decisions
     else:
         return None
+    return as_verdicts(path.name, table, read_calibration(numbers))
+
+
+def as_verdicts(source: str, table: Mapping[str, np.ndarray], numbers: Calibration) -> Verdicts:
+    """Return verdicts from the columns of verdicts.csv.
+
+    Args:
+        source: the file that says so.
+        table: its columns.
+        numbers: the frozen ones behind them.
+    """
     return Verdicts(
-        path.name,
+        source,
         table["verdict"],
         table["probability_wrong"],
         table["reason"],
@@ -160,7 +173,7 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
         table["probability_wrong_now"],
         table["reason_now"],
         stacked(table, ("x_now_m", "y_now_m", "theta_now_rad")),
-        read_calibration(numbers),
+        numbers,
     )
 
 

@@ -17,14 +17,33 @@ from taojax.audit import figures, labels, tables
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.page import Page, grid, render
 from taojax.audit.truth import read_truth
+from taojax.closures import Verdicts
 from taojax.config import AuditConfig
 from taojax.graph.answers import Closure, Run2D, Stream, read_answers
-from taojax.graph.methods import Outcome, Problem, build, optimise, optimise_all
+from taojax.graph.methods import (
+    ALONE,
+    Outcome,
+    Problem,
+    build,
+    optimise,
+    optimise_all,
+    optimise_few,
+)
+from taojax.graph.optimise import INSTALL, has_extra
 from taojax.records import Run
 from taojax.specs import write_atomically
 from taojax.verdicts import plain
 
-__all__ = ["Judged", "judge_graph", "sentences", "write_graph"]
+__all__ = [
+    "Brief",
+    "Judged",
+    "draw",
+    "headline",
+    "in_brief",
+    "judge_graph",
+    "sentences",
+    "write_graph",
+]
 
 MOST_WRONG = 0.05
 """Share of wrong answers that the similarity gate may let through on the calibration half: the
@@ -34,6 +53,15 @@ WHOLE = 0.05
 """A graph is whole if at most so much more of the test frames are off than with the oracle."""
 
 ORACLE = "oracle"
+
+RIVAL = "top1_gnc"
+"""What the one sentence compares with: the back-end that is told to survive wrong closures."""
+
+LOST = 0.5
+"""Where the right closures alone leave more of the test frames off, nothing was held."""
+
+LITTLE = 0.001
+"""Shares of frames closer than this are told as equal."""
 
 COLUMNS = 4
 """Panels side by side in the picture."""
@@ -63,7 +91,7 @@ class Judged(NamedTuple):
     """What odometry is believed to do, in words."""
 
     gate: str
-    """Where the similarity gate lies, in words."""
+    """Where the similarity gate lies, in words; empty where it was not tried."""
 
     r_out_m: float
     frames: tuple[int, int]
@@ -162,7 +190,7 @@ def judge_graph(
     truth_m: Float[np.ndarray, "t 2"],
     audit: AuditConfig,
     gap_frames: int,
-    say: Callable[[str], None] = lambda text: None,
+    say: Callable[[str], None] | None = lambda text: None,
 ) -> Judged | None:
     """Optimise the graph of the test half in every way, then hold the results against the truth.
 
@@ -171,7 +199,7 @@ def judge_graph(
         truth_m: true positions of all frames, metres.
         audit: radii and split.
         gap_frames: between calibration and test half; also the window.
-        say: told what is being optimised.
+        say: told what is being optimised; None optimises only what the one sentence needs.
 
     Returns:
         None where the recording is too short to hold a test half.
@@ -181,8 +209,11 @@ def judge_graph(
         return None
     end, first = int((split == "calibration").sum()), int(np.argmax(split == "test"))
     problem = build(run, calibration_end=end, first=first, window=gap_frames)
-    gate, said = _gated(run, truth_m[:end], audit.r_out_m)
-    found = optimise_all(problem, gate, say)
+    if say is None:
+        said, found = "", optimise_few(problem)
+    else:
+        gate, said = _gated(run, truth_m[:end], audit.r_out_m)
+        found = optimise_all(problem, gate, say)
     # From here on the truth of the test half is known.
     found.append(_oracle(problem, run, truth_m, audit.r_out_m))
     map_m = run.map_pose[:, :2]
@@ -219,39 +250,77 @@ def _measured(row: dict[str, Any]) -> str:
     return f"{plain(row['median_m'])} m median, {100 * row['off_share']:.1f} % of the frames off"
 
 
-def _headline(judged: Judged) -> str:
-    """Return the one sentence."""
-    ours, every, best = (_of(judged, name) for name in ("ours", "top1_huber", ORACLE))
-    most = best["off_share"] + WHOLE
+def _fate(row: dict[str, Any], best: dict[str, Any]) -> str:
+    """Say what became of a graph, measured by what the right closures alone make of it.
+
+    Returns:
+        whole; kept, as far as the right ones keep it; lost, as it is with them; or broken.
+    """
+    if row["off_share"] <= WHOLE:
+        return "whole"
+    if row["off_share"] > best["off_share"] + WHOLE:
+        return "broken"
+    return "kept" if best["off_share"] <= LOST else "lost"
+
+
+def is_whole(judged: Judged) -> bool:
+    """Return whether our closures break nothing that the right ones alone would hold."""
+    return _fate(_of(judged, "ours"), _of(judged, ORACLE)) != "broken"
+
+
+def headline(judged: Judged) -> str:
+    """Return the one sentence: our closures, all first candidates, and the right ones alone."""
+    ours, every, best = (_of(judged, name) for name in ("ours", RIVAL, ORACLE))
     if not ours["closures"]:
         note = next(o.note for o in judged.outcomes if o.method == "ours")
-        start = f"The graph is odometry alone ({note}): {_measured(ours)}"
-    elif ours["off_share"] <= most:
-        start = f"With these closures the graph stays whole: {_measured(ours)}"
+        start = f"The graph is odometry alone ({note.removeprefix(ALONE)})"
     else:
-        start = f"With these closures the graph does not stay whole: {_measured(ours)}"
-    fate = "it holds too" if every["off_share"] <= most else "it breaks"
+        start = {
+            "whole": "With these closures the graph stays whole",
+            "kept": "With these closures the graph stays as whole as the right ones alone keep it",
+            "lost": "These closures do not hold the graph, nor do the right ones alone",
+            "broken": "With these closures the graph breaks",
+        }[_fate(ours, best)]
+    fate = {
+        "whole": "stays whole", "kept": "is kept too", "lost": "does not hold", "broken": "breaks",
+    }  # fmt: skip
+    rival = fate[_fate(every, best)]
+    gap = ours["off_share"] - every["off_share"]
+    is_behind = gap > LITTLE or (abs(gap) <= LITTLE and ours["median_m"] > every["median_m"])
+    right = (
+        f"the right ones alone: {_measured(best)}"
+        if best["closures"]
+        else "none of the first candidates is right"
+    )
     return (
-        f"{start}; with all first candidates under a Huber kernel {fate}: {_measured(every)}; with "
-        f"the right ones alone: {_measured(best)}. Off means more than {judged.r_out_m:g} m, on "
-        f"the test frames {judged.frames[0]} to {judged.frames[1]}."
+        f"{start}: {_measured(ours)}; with all first candidates and GNC it {rival}: "
+        f"{_measured(every)}{', which is better here' if is_behind else ''}; {right}. Off means "
+        f"more than {judged.r_out_m:g} m, on the test frames {judged.frames[0]} to "
+        f"{judged.frames[1]}."
     )
 
 
 def sentences(judged: Judged) -> tuple[str, ...]:
     """Return what was found, most important first."""
     notes = [f"{TITLES[o.method]}: {o.note}." for o in judged.outcomes if o.note]
-    return (_headline(judged), judged.noise, judged.gate, *dict.fromkeys(notes))
+    gate = [judged.gate] if judged.gate else []
+    return (headline(judged), judged.noise, *gate, *dict.fromkeys(notes))
 
 
-def draw(judged: Judged) -> Picture:
-    """Draw the trajectory of every method on the map."""
+def draw(judged: Judged, name: str = "graph") -> Picture:
+    """Draw the trajectory of every method on the map.
+
+    Args:
+        judged: what became of each.
+        name: of the picture's files.
+    """
     n = len(judged.outcomes)
-    n_rows = -(-n // COLUMNS)
+    across = min(n, COLUMNS)
+    n_rows = -(-n // across)
     wide, high = plots.map_size(judged.map_m, judged.truth_m, wide_in=3.4, most_in=3.0)
-    size = (wide * COLUMNS, (high - plots.BELOW_MAP_IN + 0.55) * n_rows + 0.6)
+    size = (wide * across, (high - plots.BELOW_MAP_IN + 0.55) * n_rows + 0.6)
     figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(n_rows, COLUMNS, squeeze=False).ravel()
+    axes = figure.subplots(n_rows, across, squeeze=False).ravel()
     columns = {
         "frame": np.arange(judged.frames[0], judged.frames[1] + 1),
         "true_x_m": judged.truth_m[:, 0],
@@ -279,7 +348,60 @@ def draw(judged: Judged) -> Picture:
         "closures. A wrong closure pulls the trajectory from where the robot was to where the "
         "answer lies. Trajectories may leave the frame."
     )
-    return picture(figure, "graph", "What the closures do to the graph", caption, csv_text(columns))
+    return picture(figure, name, "What the closures do to the graph", caption, csv_text(columns))
+
+
+class Brief(NamedTuple):
+    """What the report of a run says of the graph."""
+
+    sentence: str
+    """Empty where there is no graph to speak of."""
+
+    picture: Picture | None = None
+    is_lead: bool = False
+    """Whether it was measured, and belongs on the first screen."""
+
+    is_alarm: bool = False
+
+
+LACKS = (
+    f"What these closures do to a pose graph is not said here: it needs GTSAM ({INSTALL}, then "
+    "judge again or run `taojax graph`)."
+)
+"""Said where the extra is missing."""
+
+
+def in_brief(
+    folder: Path,
+    sealed: Run,
+    verdicts: Verdicts,
+    truth_m: Float[np.ndarray, "t 2"],
+    audit: AuditConfig,
+    gap_frames: int,
+) -> Brief:
+    """Optimise the graph of a run with three methods alone, and say what became of it.
+
+    Args:
+        folder: the run.
+        sealed: read from it by `records.read_run`.
+        verdicts: what was decided.
+        truth_m: true positions, metres.
+        audit: radii and split.
+        gap_frames: between calibration and test half.
+
+    Returns:
+        One sentence and the picture; how to get them without the extra; nothing where the run
+        holds no odometry or no test half.
+    """
+    if "odometry.csv" not in sealed.manifest["sha256"] or "map_spacing_m" not in sealed.manifest:
+        return Brief("")
+    if not has_extra():
+        return Brief(LACKS)
+    run = read_answers(folder, sealed, verdicts)
+    judged = judge_graph(run, truth_m, audit, gap_frames, None)
+    if judged is None:
+        return Brief("")
+    return Brief(headline(judged), draw(judged, "graph_brief"), True, not is_whole(judged))
 
 
 def _page(judged: Judged, drawn: Picture, facts: dict[str, str], command: str) -> str:

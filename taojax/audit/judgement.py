@@ -183,3 +183,9 @@ class Evaluation(NamedTuple):
 
     command: str
     """How to repeat the judging."""
+
+    lead: tuple[str, ...] = ()
+    """Sentences on the graph that belong on the first screen; some of `sentences`."""
+
+    warnings: tuple[str, ...] = ()
+    """Those of them that should alarm."""

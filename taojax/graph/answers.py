@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from taojax.closures import build_graph, read_verdicts
+from taojax.closures import Verdicts, build_graph, read_verdicts
 from taojax.errors import InputError
 from taojax.records import Run
 
@@ -89,17 +89,18 @@ def _raw(run: Run, map_pose: np.ndarray, sigma_m: float) -> tuple[Stream, np.nda
     return Stream(has, pose, every, unsure), similarity
 
 
-def read_answers(folder: Path, run: Run) -> Run2D:
+def read_answers(folder: Path, run: Run, verdicts: Verdicts | None = None) -> Run2D:
     """Read what a run answered and decided. The only place that knows the columns of its files.
 
     Args:
         folder: the run.
         run: read from it by `records.read_run`.
+        verdicts: what was decided; read from the folder when omitted.
 
     Raises:
         InputError: nothing is decided, or the run was sealed without its odometry.
     """
-    verdicts = read_verdicts(folder, run)
+    verdicts = verdicts or read_verdicts(folder, run)
     if verdicts is None:
         raise InputError(
             f"{folder}: nothing is decided here; judge it with `taojax evaluate`, or score with"

@@ -13,7 +13,10 @@ from taojax.graph.consistency import consistent, exact_clique, greedy_clique
 from taojax.graph.odometry import FEW, Chain, Noise, dead_reckoning, estimate, steps_m
 from taojax.graph.optimise import BackEnd, Solution, solve
 
-__all__ = ["Outcome", "Problem", "build", "optimise", "optimise_all"]
+__all__ = ["ALONE", "Outcome", "Problem", "build", "optimise", "optimise_all", "optimise_few"]
+
+ALONE = "no closure: odometry alone, "
+"""Begins the note of a method without closures."""
 
 CLIQUE_S = 10.0
 """Time for the largest consistent set; after that the largest one found is taken."""
@@ -142,7 +145,7 @@ def optimise(
     solution = solve(problem.chain, closures, back_end, problem.anchor, problem.area_m2)
     took = before_s + time.perf_counter() - start
     if not closures:
-        note = f"no closure: odometry alone, {problem.anchored}"
+        note = f"{ALONE}{problem.anchored}"
     return Outcome(method, tuple(closures), solution, took, note)
 
 
@@ -167,6 +170,13 @@ def _paired(problem: Problem, closures: tuple[Closure, ...]) -> list[Outcome]:
         chosen = [thinned[row] for row in clique.rows]
         found.append(optimise(problem, name, chosen, "plain", note=said, before_s=took))
     return found
+
+
+def optimise_few(problem: Problem) -> list[Outcome]:
+    """Run the two methods that one sentence compares: all first candidates, and ours."""
+    top1, final = problem.answers.top1, problem.answers.final
+    raw, ours = _of(problem, top1, top1.accepted), _of(problem, final, final.accepted)
+    return [optimise(problem, "top1_gnc", raw, "gnc"), optimise(problem, "ours", ours, "plain")]
 
 
 def optimise_all(

@@ -15,9 +15,12 @@ from taojax.errors import MissingExtraError
 from taojax.graph.answers import Closure
 from taojax.graph.odometry import Chain, dead_reckoning
 
-__all__ = ["BackEnd", "Solution", "check_extra", "solve"]
+__all__ = ["INSTALL", "BackEnd", "Solution", "check_extra", "has_extra", "solve"]
 
 BackEnd = Literal["plain", "huber", "geman_mcclure", "gnc", "switch"]
+
+INSTALL = "python -m pip install 'taojax[graph]'"
+"""Brings GTSAM."""
 
 HUBER = 1.345
 """Residual in standard deviations at which Huber's kernel turns linear: 95 % efficiency on Gaussian
@@ -59,14 +62,19 @@ class Solution(NamedTuple):
     """What GNC or the switches left of each closure, 0 to 1; 1 for the other back-ends."""
 
 
+def has_extra() -> bool:
+    """Return whether GTSAM is there."""
+    return importlib.util.find_spec("gtsam") is not None
+
+
 def check_extra() -> None:
     """Check, before any work, that GTSAM is there.
 
     Raises:
         MissingExtraError: it is not.
     """
-    if importlib.util.find_spec("gtsam") is None:
-        raise MissingExtraError("graph needs gtsam; run: python -m pip install 'taojax[graph]'")
+    if not has_extra():
+        raise MissingExtraError(f"graph needs gtsam; run: {INSTALL}")
 
 
 def _aligned(path: np.ndarray, rows: np.ndarray, closures: Sequence[Closure]) -> np.ndarray:
