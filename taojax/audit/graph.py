@@ -15,9 +15,10 @@ from matplotlib.figure import Figure
 from taojax import plots
 from taojax.audit import figures, labels, tables
 from taojax.audit.figures import Picture, csv_text, picture
+from taojax.audit.own_map import nearest_known
 from taojax.audit.page import Page, grid, render
-from taojax.audit.truth import read_truth
-from taojax.closures import Verdicts
+from taojax.audit.truth import Truth, read_truth
+from taojax.closures import Verdicts, compose
 from taojax.config import AuditConfig
 from taojax.graph.answers import Closure, Run2D, Stream, read_answers
 from taojax.graph.methods import (
@@ -101,6 +102,9 @@ class Judged(NamedTuple):
     truth_m: Float[np.ndarray, "n 2"]
     """Of the test frames, metres."""
 
+    paths_m: tuple[Float[np.ndarray, "n 2"], ...]
+    """Per method: optimised positions of the test frames."""
+
     wrong: tuple[Float[np.ndarray, "_ 2 2"], ...]
     """Per method: true and answered position of its wrong closures, metres."""
 
@@ -127,25 +131,49 @@ def gate_level(
     return float(similarity[order[good[-1]]]) if good.size else float("inf")
 
 
-def _errors(stream: Stream, truth_m: np.ndarray) -> np.ndarray:
+def _errors(stream: Stream, truth: np.ndarray) -> np.ndarray:
     """Return distances from answers to the truth (n,), metres; NaN without an answer."""
-    return np.hypot(*(stream.pose[: len(truth_m), :2] - truth_m).T)
+    pose = stream.pose[: len(truth)]
+    if stream.anchor is not None and stream.motion is not None:
+        row = stream.anchor[: len(truth)]
+        led = compose(truth[np.maximum(row, 0)], stream.motion[: len(truth)])
+        pose = np.where((row >= 0)[:, None], led, np.nan)
+    return np.hypot(*(pose[:, :2] - truth[:, :2]).T)
 
 
-def _is_wrong(closure: Closure, truth_m: np.ndarray, r_out_m: float) -> bool:
-    return bool(np.hypot(*(closure.pose[:2] - truth_m[closure.frame])) > r_out_m)
+def _answered_m(closure: Closure, truth: np.ndarray) -> np.ndarray:
+    """Return where a closure says the robot was: on the map, or from the true place it names."""
+    if closure.tie is None:
+        return closure.pose[:2]
+    return compose(truth[closure.tie.frame], closure.tie.motion)[:2]
+
+
+def _is_wrong(closure: Closure, truth: np.ndarray, r_out_m: float) -> bool:
+    away = _answered_m(closure, truth) - truth[closure.frame, :2]
+    return bool(np.hypot(*away) > r_out_m)
+
+
+def _laid(path: np.ndarray, truth_m: np.ndarray) -> np.ndarray:
+    """Lay a trajectory that floats rigidly on the truth: least squared distances, (n, 2).
+
+    Umeyama, Least-squares estimation of transformation parameters, PAMI 1991, without scale.
+    """
+    a, b = path[:, 0] + 1j * path[:, 1], truth_m[:, 0] + 1j * truth_m[:, 1]
+    turn = np.exp(1j * np.angle(np.vdot(a - a.mean(), b - b.mean())))
+    laid = turn * (a - a.mean()) + b.mean()
+    return np.stack([laid.real, laid.imag], axis=1)
 
 
 def _row(
     outcome: Outcome,
-    first: int,
-    truth_m: np.ndarray,
+    path_m: np.ndarray,
+    truth: np.ndarray,
     label: np.ndarray,
     r_out_m: float,
 ) -> dict[str, Any]:
-    error = np.hypot(*(outcome.solution.pose[:, :2] - truth_m[first:]).T)
+    error = np.hypot(*(path_m - truth[-len(path_m) :, :2]).T)
     is_off, inside = error > r_out_m, label == "in_map"
-    wrong = [_is_wrong(closure, truth_m, r_out_m) for closure in outcome.closures]
+    wrong = [_is_wrong(closure, truth, r_out_m) for closure in outcome.closures]
     median, p95 = np.percentile(error, (50, 95))
     row = {
         "method": outcome.method, "closures": len(wrong), "rmse_m": np.sqrt(np.mean(error**2)),
@@ -168,26 +196,26 @@ def _split(n: int, audit: AuditConfig, gap_frames: int) -> Shaped[np.ndarray, " 
     return cut.name
 
 
-def _gated(run: Run2D, truth_m: np.ndarray, r_out_m: float) -> tuple[float, str]:
-    """Set the gate with the truth of the calibration half, `truth_m` (n, 2)."""
-    error = _errors(run.answers.top1, truth_m)
-    level = gate_level(run.answers.similarity[: len(truth_m)], ~(error <= r_out_m), MOST_WRONG)
+def _gated(run: Run2D, truth: np.ndarray, r_out_m: float) -> tuple[float, str]:
+    """Set the gate with the truth of the calibration half alone."""
+    error = _errors(run.answers.top1, truth)
+    level = gate_level(run.answers.similarity[: len(truth)], ~(error <= r_out_m), MOST_WRONG)
     share = f"at most {100 * MOST_WRONG:g} % of the calibration answers"
     if np.isinf(level):
         return level, f"Similarity gate: shut, for no level keeps {share} from being wrong."
     return level, f"Similarity gate: {plain(level)}, above which {share} are wrong."
 
 
-def _oracle(problem: Problem, run: Run2D, truth_m: np.ndarray, r_out_m: float) -> Outcome:
-    top1, first = run.answers.top1, problem.chain.first
-    right = top1.accepted & (_errors(top1, truth_m) <= r_out_m)
+def _oracle(problem: Problem, run: Run2D, truth: np.ndarray, r_out_m: float) -> Outcome:
+    top1, first = run.answers.top1, problem.first
+    right = top1.accepted & (_errors(top1, truth) <= r_out_m)
     right[:first] = False
     return optimise(problem, ORACLE, top1.closures(right), "plain")
 
 
 def judge_graph(
     run: Run2D,
-    truth_m: Float[np.ndarray, "t 2"],
+    truth: Float[np.ndarray, "t _"],
     audit: AuditConfig,
     gap_frames: int,
     say: Callable[[str], None] | None = lambda text: None,
@@ -196,7 +224,8 @@ def judge_graph(
 
     Args:
         run: from `read_answers`.
-        truth_m: true positions of all frames, metres.
+        truth: true positions of all frames, metres; and headings [rad], which one drive that
+            closes on itself needs.
         audit: radii and split.
         gap_frames: between calibration and test half; also the window.
         say: told what is being optimised; None optimises only what the one sentence needs.
@@ -204,7 +233,7 @@ def judge_graph(
     Returns:
         None where the recording is too short to hold a test half.
     """
-    split = _split(len(truth_m), audit, gap_frames)
+    split = _split(len(truth), audit, gap_frames)
     if not (split == "test").any():
         return None
     end, first = int((split == "calibration").sum()), int(np.argmax(split == "test"))
@@ -212,19 +241,30 @@ def judge_graph(
     if say is None:
         said, found = "", optimise_few(problem)
     else:
-        gate, said = _gated(run, truth_m[:end], audit.r_out_m)
+        gate, said = _gated(run, truth[:end], audit.r_out_m)
         found = optimise_all(problem, gate, say)
     # From here on the truth of the test half is known.
-    found.append(_oracle(problem, run, truth_m, audit.r_out_m))
-    map_m = run.map_pose[:, :2]
-    nearest = labels.nearest_map_distance(truth_m[first:], map_m)
+    found.append(_oracle(problem, run, truth, audit.r_out_m))
+    truth_m = truth[:, :2]
+    paths = [o.solution.pose[:, :2] for o in found]
+    if run.is_own:
+        # Nothing says where the drive lies but itself.
+        paths = [_laid(path, truth_m)[first:] for path in paths]
+        nearest = nearest_known(truth_m, run.odometry, run.own_gap_m)[first:]
+        map_m = truth_m
+    else:
+        map_m = run.map_pose[:, :2]
+        nearest = labels.nearest_map_distance(truth_m[first:], map_m)
     label = labels.label_frames(nearest, audit.r_in_m, audit.r_out_m)
-    rows = [_row(outcome, first, truth_m, label, audit.r_out_m) for outcome in found]
+    rows = [
+        _row(outcome, path, truth, label, audit.r_out_m)
+        for outcome, path in zip(found, paths, strict=True)
+    ]
     wrong = tuple(
         np.array([
-            (truth_m[c.frame], c.pose[:2])
+            (truth_m[c.frame], _answered_m(c, truth))
             for c in outcome.closures
-            if _is_wrong(c, truth_m, audit.r_out_m)
+            if _is_wrong(c, truth, audit.r_out_m)
         ]).reshape(-1, 2, 2)
         for outcome in found
     )  # fmt: skip
@@ -237,6 +277,7 @@ def judge_graph(
         frames=(first, len(truth_m) - 1),
         map_m=map_m,
         truth_m=truth_m[first:],
+        paths_m=tuple(paths),
         wrong=wrong,
     )
 
@@ -327,8 +368,9 @@ def draw(judged: Judged, name: str = "graph") -> Picture:
         "true_y_m": judged.truth_m[:, 1],
     }
     lines: dict[str, Any] = {}
-    for ax, outcome, wrong in zip(axes, judged.outcomes, judged.wrong, strict=False):
-        path = outcome.solution.pose[:, :2]
+    for ax, outcome, path, wrong in zip(
+        axes, judged.outcomes, judged.paths_m, judged.wrong, strict=False
+    ):
         plots.graph_map(judged.map_m, judged.truth_m, path, wrong, ax=ax)
         row = _of(judged, outcome.method)
         said = f"{plain(row['median_m'])} m median, {len(wrong)} of {row['closures']:.0f} wrong"
@@ -349,6 +391,10 @@ def draw(judged: Judged, name: str = "graph") -> Picture:
         "answer lies. Trajectories may leave the frame."
     )
     return picture(figure, name, "What the closures do to the graph", caption, csv_text(columns))
+
+
+def _truth(known: Truth) -> np.ndarray:
+    return np.column_stack([known.xy_m, known.theta_rad])
 
 
 class Brief(NamedTuple):
@@ -375,7 +421,7 @@ def in_brief(
     folder: Path,
     sealed: Run,
     verdicts: Verdicts,
-    truth_m: Float[np.ndarray, "t 2"],
+    known: Truth,
     audit: AuditConfig,
     gap_frames: int,
 ) -> Brief:
@@ -385,7 +431,7 @@ def in_brief(
         folder: the run.
         sealed: read from it by `records.read_run`.
         verdicts: what was decided.
-        truth_m: true positions, metres.
+        known: the truth of the same recording.
         audit: radii and split.
         gap_frames: between calibration and test half.
 
@@ -398,7 +444,7 @@ def in_brief(
     if not has_extra():
         return Brief(LACKS)
     run = read_answers(folder, sealed, verdicts)
-    judged = judge_graph(run, truth_m, audit, gap_frames, None)
+    judged = judge_graph(run, _truth(known), audit, gap_frames, None)
     if judged is None:
         return Brief("")
     return Brief(headline(judged), draw(judged, "graph_brief"), True, not is_whole(judged))
@@ -454,7 +500,7 @@ def write_graph(  # noqa: PLR0913 - a run, its truth, how it is judged, where it
     """
     run = read_answers(folder, sealed)
     known = read_truth(truth, len(run.odometry))
-    judged = judge_graph(run, known.xy_m, audit, gap_frames, say)
+    judged = judge_graph(run, _truth(known), audit, gap_frames, say)
     if judged is None:
         return ("The recording is too short to hold a test half: there is no graph to judge.",)
     drawn = draw(judged)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from taojax.closures import between, compose
 from taojax.graph.answers import Answers, Closure, Run2D, Stream
 from taojax.graph.consistency import consistent, exact_clique, greedy_clique
-from taojax.graph.odometry import FEW, Chain, Noise, dead_reckoning, estimate, steps_m
+from taojax.graph.odometry import DRIFTING, FEW, Chain, Noise, dead_reckoning, estimate, steps_m
 from taojax.graph.optimise import BackEnd, Solution, solve
 
 __all__ = ["ALONE", "Outcome", "Problem", "build", "optimise", "optimise_all", "optimise_few"]
@@ -39,6 +39,9 @@ class Problem(NamedTuple):
 
     area_m2: float
     """Of the box around the map."""
+
+    first: int = 0
+    """First frame of the test half, whose closures count; the chain may begin earlier."""
 
 
 class Outcome(NamedTuple):
@@ -109,17 +112,21 @@ def build(run: Run2D, *, calibration_end: int, first: int, window: int) -> Probl
     final = run.answers.final
     low, high = run.map_pose[:, :2].min(axis=0), run.map_pose[:, :2].max(axis=0)
     area = float(np.prod(np.maximum(high - low, run.spacing_m)))
+    if run.is_own:
+        # Both ends of a closure are free: the graph is the whole drive, fixed at its first frame.
+        whole = _cut(run, 0, len(run.odometry), DRIFTING)
+        anchor = run.map_pose[np.flatnonzero(whole.is_start)]
+        return Problem(run.answers, whole, anchor, "from its first frame", area, first)
     accepted = final.closures(final.accepted & _among(final, 0, calibration_end))
     calibration = _cut(run, 0, calibration_end, FEW)
     noise = estimate(calibration, accepted, window, area)
     chain = _cut(run, first, len(run.odometry), noise)
     anchor, said = _anchors(run, chain)
-    return Problem(run.answers, chain, anchor, said, area)
+    return Problem(run.answers, chain, anchor, said, area, first)
 
 
 def _of(problem: Problem, stream: Stream, chosen: np.ndarray) -> tuple[Closure, ...]:
-    first = problem.chain.first
-    return stream.closures(chosen & _among(stream, first, first + len(problem.chain.odometry)))
+    return stream.closures(chosen & _among(stream, problem.first, len(stream.accepted)))
 
 
 def optimise(

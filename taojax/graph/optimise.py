@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from taojax.closures import compose, in_axes_of, wrap
+from taojax.closures import between, compose, in_axes_of, wrap
 from taojax.errors import MissingExtraError
 from taojax.graph.answers import Closure
 from taojax.graph.odometry import Chain, dead_reckoning
@@ -122,6 +122,8 @@ def _starts(
     them, where all have a heading. Stretches without closures start at their anchor.
     """
     path = dead_reckoning(chain.odometry, chain.is_start)
+    if any(c.tie is not None for c in closures):
+        return (compose(anchor[0], path),)
     row_of = np.array([c.frame - chain.first for c in closures], int)
     laid, joined, has_heading = path.copy(), path.copy(), True
     for (first, end), pose in zip(chain.parts(), anchor, strict=True):
@@ -144,7 +146,8 @@ def _odometry_graph(chain: Chain, closures: Sequence[Closure], start: np.ndarray
 
     graph, diagonal = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Diagonal.Sigmas
     sigma = np.sqrt(chain.variances())
-    rows = {c.frame - chain.first for c in closures}
+    # A closure onto the fixed map holds its stretch; one between two free frames does not.
+    rows = {c.frame - chain.first for c in closures if c.tie is None}
     for first, end in chain.parts():
         length = float(chain.way_m[first:end].sum())
         is_open = rows.isdisjoint(range(first, end))
@@ -174,6 +177,9 @@ def _factor(closure: Closure, first: int, weight: float = 1.0, kernel: Any = Non
     noise: Any = gtsam.noiseModel.Gaussian.Covariance(known)
     if kernel is not None:
         noise = gtsam.noiseModel.Robust.Create(kernel, noise)
+    if closure.tie is not None:
+        other = closure.tie.frame - first
+        return gtsam.BetweenFactorPose2(other, row, gtsam.Pose2(*closure.tie.motion), noise)
     if has_heading:
         return gtsam.PriorFactorPose2(row, gtsam.Pose2(*closure.pose), noise)
     # The error of a prior on the whole pose would mix an unknown heading into the position.
@@ -227,8 +233,15 @@ def _residuals(pose: np.ndarray, chain: Chain, closures: Sequence[Closure]) -> n
     """Return the log densities of all closures at the poses [1 / (m^2 rad)], (c,)."""
     rows = [c.frame - chain.first for c in closures]
     gap = np.array([c.pose for c in closures]) - pose[rows]
-    gap[:, 2] = wrap(gap[:, 2])
     spread = np.array([c.covariance for c in closures])
+    if closures[0].tie is not None:
+        # In axes of the answer, which move with the older end.
+        leads = np.array(
+            [compose(pose[c.tie.frame - chain.first], c.tie.motion) for c in closures if c.tie]
+        )
+        gap = between(leads, pose[rows])
+        spread = in_axes_of(np.array([c.pose for c in closures]), spread)
+    gap[:, 2] = wrap(gap[:, 2])
     log_p = np.empty(len(closures))
     has_heading = np.isfinite(spread[:, 2, 2])
     for chosen, n in ((has_heading, 3), (~has_heading, 2)):
