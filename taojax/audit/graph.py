@@ -295,18 +295,19 @@ def _fate(row: dict[str, Any], best: dict[str, Any]) -> str:
     """Say what became of a graph, measured by what the right closures alone make of it.
 
     Returns:
-        whole; kept, as far as the right ones keep it; lost, as it is with them; or broken.
+        whole; kept, as far as the right ones keep it; lost, as it is with them; broken; or drifts,
+        where too few closures hold it but none of them is wrong.
     """
     if row["off_share"] <= WHOLE:
         return "whole"
     if row["off_share"] > best["off_share"] + WHOLE:
-        return "broken"
+        return "broken" if row["wrong_share"] > 0 else "drifts"
     return "kept" if best["off_share"] <= LOST else "lost"
 
 
 def is_whole(judged: Judged) -> bool:
     """Return whether our closures break nothing that the right ones alone would hold."""
-    return _fate(_of(judged, "ours"), _of(judged, ORACLE)) != "broken"
+    return _fate(_of(judged, "ours"), _of(judged, ORACLE)) not in ("broken", "drifts")
 
 
 def headline(judged: Judged) -> str:
@@ -321,15 +322,17 @@ def headline(judged: Judged) -> str:
             "kept": "With these closures the graph stays as whole as the right ones alone keep it",
             "lost": "These closures do not hold the graph, nor do the right ones alone",
             "broken": "With these closures the graph breaks",
+            "drifts": "None of these closures is wrong, but where none holds the graph it drifts",
         }[_fate(ours, best)]
     fate = {
         "whole": "stays whole", "kept": "is kept too", "lost": "does not hold", "broken": "breaks",
+        "drifts": "drifts",
     }  # fmt: skip
     rival = fate[_fate(every, best)]
     gap = ours["off_share"] - every["off_share"]
     is_behind = gap > LITTLE or (abs(gap) <= LITTLE and ours["median_m"] > every["median_m"])
     right = (
-        f"the right ones alone: {_measured(best)}"
+        f"with the right ones alone: {_measured(best)}"
         if best["closures"]
         else "none of the first candidates is right"
     )

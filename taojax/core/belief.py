@@ -59,7 +59,7 @@ def uninformed(
     # Explicit types: a weakly typed start would compile the second step again.
     off = jnp.asarray(config.start_off, jnp.float32)
     n = jnp.asarray(n_anchors if n_known is None else n_known, jnp.float32)
-    is_known = (jnp.arange(n_anchors) < n).astype(jnp.float32)
+    is_known = (jnp.arange(n_anchors, dtype=jnp.float32) < n).astype(jnp.float32)
     return Belief(jnp.broadcast_to(is_known * ((1.0 - off) / (2 * n)), (2, n_anchors)), off)
 
 
@@ -115,7 +115,7 @@ def predict(
         The belief after it. What would have come from outside the map is off it now.
     """
     grid, gap_m = places.grid, places.gap_m
-    is_known = jnp.arange(grid.xy.shape[0]) < places.n_known
+    is_known = jnp.arange(grid.xy.shape[0], dtype=jnp.float32) < places.n_known
     driven = jnp.sqrt(motion[0] ** 2 + motion[1] ** 2)
     units = jnp.minimum(1.0, driven / places.unit_m)
     stays_on = (1.0 - config.leave) ** units
@@ -142,7 +142,7 @@ def predict(
     gone = jnp.maximum(1.0 - belief.off - jnp.sum(arriving), 0.0)
     back = (1.0 - stays_off) * belief.off
     anywhere = jnp.where(is_known, back / (2 * places.n_known), 0.0)
-    return _normalised(arriving + anywhere, belief.off - back + gone)
+    return _normalised(arriving + anywhere[None], belief.off - back + gone)
 
 
 def _normalised(mass: Float[Array, "2 m"], off: Float[Array, ""]) -> Belief:

@@ -16,6 +16,9 @@ DIRECTION_RAD = 0.3
 """Standard deviation between the direction of travel and that of a map image, or its reverse,
 where the heading was not answered [rad]: a lane change, a bend between two images."""
 
+AROUND = 5
+"""Frames to either side whose candidates say in which direction a place is travelled."""
+
 UNSURE = 0.5
 """Probability of being wrong of an answer that carries none."""
 
@@ -74,8 +77,8 @@ class Stream(NamedTuple):
         rows = np.flatnonzero(chosen & np.isfinite(self.pose[:, 0]))
         p = np.where(np.isnan(self.probability_wrong), UNSURE, self.probability_wrong)
         return tuple(
-            Closure(int(t), self.pose[t], self.covariance[t], float(p[t]), self._tie(t))
-            for t in rows
+            Closure(t, self.pose[t], self.covariance[t], float(p[t]), self._tie(t))
+            for t in rows.tolist()
         )
 
 
@@ -128,15 +131,23 @@ def _raw(run: Run, map_pose: np.ndarray, sigma_m: float) -> tuple[Stream, np.nda
     return Stream(has, pose, every, unsure), similarity
 
 
-def _headed(stream: Stream, drive: np.ndarray) -> Stream:
+def _headed(stream: Stream, index: np.ndarray) -> Stream:
     """Give first candidates of one drive a heading: that of their place, or the other way.
 
-    A factor between two free poses needs one. Odometry says which of the two it is; by how far a
-    lane or a bend may turn it, `DIRECTION_RAD` says.
+    A factor between two free poses needs one. Where the candidates of the frames around run
+    backwards along the drive, the place is travelled the other way; by how far a lane or a bend may
+    turn it, `DIRECTION_RAD` says.
     """
-    turned = np.cos(drive[:, 2] - stream.pose[:, 2]) < 0
+    n, votes = len(index), np.zeros(len(index))
+    for away in range(1, AROUND + 1):
+        if n <= 2 * away:
+            break
+        before, after = index[: -2 * away], index[2 * away :]
+        step = after - before
+        is_near = (before >= 0) & (after >= 0) & (np.abs(step) <= 4 * away)
+        votes[away:-away] += np.where(is_near, np.sign(step), 0)
     pose = stream.pose.copy()
-    pose[:, 2] = wrap(np.where(turned, pose[:, 2] + np.pi, pose[:, 2]))
+    pose[:, 2] = wrap(np.where(votes < 0, pose[:, 2] + np.pi, pose[:, 2]))
     covariance = stream.covariance.copy()
     covariance[:, 2, 2] = DIRECTION_RAD**2
     return stream._replace(pose=pose, covariance=covariance)
@@ -167,7 +178,7 @@ def read_answers(folder: Path, run: Run, verdicts: Verdicts | None = None) -> Ru
     graph = build_graph(folder, run, verdicts)
     top1, similarity = _raw(run, graph.map_pose, graph.sigma_m)
     if graph.is_own:
-        top1 = _headed(top1, graph.map_pose)
+        top1 = _headed(top1, run.index[:, 0].astype(int))
     final = Stream(verdicts.verdict == "accept", graph.pose, graph.covariance, verdicts.probability)
     now = Stream(
         verdicts.verdict_now == "accept", verdicts.pose_now, graph.covariance,

@@ -35,6 +35,10 @@ INLIERS = 0.99
 LM_STEPS = 100
 """Most steps of Levenberg-Marquardt."""
 
+FREE_STEPS = 10
+"""The same within a round of GNC where both ends of closures are free: a step takes ten times as
+long there, and the next round goes on from where one ends."""
+
 SWITCH_STEPS = 30
 """Most rounds of the switches; they settle in about ten."""
 
@@ -201,6 +205,26 @@ def _poses(values: Any) -> np.ndarray:
     return np.asarray(gtsam.utilities.extractPose2(values))
 
 
+def _lago(chain: Chain, closures: Sequence[Closure], start: np.ndarray) -> np.ndarray:
+    """Return a first guess whose headings solve the linear part of the problem, (n, 3).
+
+    Odometry that has turned too far leads into a wrong minimum; this does not start from it.
+    Carlone, Aragues, Castellanos & Bona, A fast and accurate approximation for planar pose graph
+    optimization, IJRR 2014. It takes diagonal covariances alone.
+    """
+    import gtsam
+
+    graph = _odometry_graph(chain, closures, start)
+    for closure in closures:
+        if closure.tie is None:
+            continue
+        sigma = np.sqrt(np.diag(in_axes_of(closure.pose, closure.covariance)))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+        ends = closure.tie.frame - chain.first, closure.frame - chain.first
+        graph.add(gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*closure.tie.motion), noise))
+    return _poses(gtsam.lago.initialize(graph))
+
+
 def _minimise(graph: Any, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the poses that Levenberg-Marquardt ends at, (n, 3), and their cost."""
     import gtsam
@@ -212,15 +236,20 @@ def _minimise(graph: Any, start: np.ndarray) -> tuple[np.ndarray, float]:
     return _poses(values), float(graph.error(values))
 
 
-def _gnc(graph: Any, start: np.ndarray, n_closures: int) -> Solution:
+def _gnc(graph: Any, start: np.ndarray, n_closures: int, *, is_free: bool) -> Solution:
     """Solve by graduated non-convexity with truncated least squares; odometry is never doubted.
 
     Yang, Antonante, Tzoumas & Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L
-    2020. The closures are the last factors of the graph.
+    2020. The closures are the last factors of the graph; with both ends free a round of it takes
+    few steps.
     """
     import gtsam
 
     params = gtsam.GncLMParams()
+    if is_free:
+        steps = gtsam.LevenbergMarquardtParams()
+        steps.setMaxIterations(FREE_STEPS)
+        params = gtsam.GncLMParams(steps)
     trusted = graph.size() - n_closures
     params.setKnownInliers(list(range(trusted)))
     optimizer = gtsam.GncLMOptimizer(graph, _values(start), params)
@@ -316,10 +345,12 @@ def solve(
         return graph
 
     plain = with_closures()
+    is_free = closures[0].tie is not None
+    starts = (*starts, *((_lago(chain, closures, starts[0]),) if is_free else ()))
     pose, _ = min((_minimise(plain, start) for start in starts), key=lambda found: found[1])
     estimator = gtsam.noiseModel.mEstimator
     if back_end == "gnc":
-        return _gnc(plain, pose, len(closures))
+        return _gnc(plain, pose, len(closures), is_free=is_free)
     if back_end == "switch":
 
         def odometry() -> Any:

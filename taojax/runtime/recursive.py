@@ -47,7 +47,7 @@ def init_recursive(tables: MapTables) -> RecursiveState:
     """Return the belief before the first frame: anywhere on the map."""
     # Explicit types: a weakly typed start would compile the second step again.
     n_anchors, n = tables.grid.xy.shape[0], tables.places.n_known
-    is_known = (jnp.arange(n_anchors) < n).astype(jnp.float32)
+    is_known = (jnp.arange(n_anchors, dtype=jnp.float32) < n).astype(jnp.float32)
     mass = jnp.broadcast_to(is_known * ((1.0 - START_OFF) / (2 * n)), (2, n_anchors))
     return RecursiveState(mass, jnp.full((), START_OFF, jnp.float32))
 
@@ -114,7 +114,8 @@ def recursive_step(
     gone = jnp.maximum(1.0 - state.off - jnp.sum(arriving), 0.0)
     off = STAY_OFF * state.off + gone
     n = tables.places.n_known
-    mass = arriving + jnp.where(jnp.arange(m) < n, (1.0 - STAY_OFF) * state.off / (2 * n), 0.0)
+    anywhere = (1.0 - STAY_OFF) * state.off / (2 * n)
+    mass = arriving + jnp.where(jnp.arange(m, dtype=jnp.float32) < n, anywhere, 0.0)[None]
 
     # An anchor that the list lacks looks like background, whose evidence is 1.
     listed = jnp.where(index >= 0, index, m)

@@ -1,9 +1,10 @@
 """A whole data set through the stream into one sealed table, with progress."""
 
 import platform
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -210,7 +211,8 @@ def _score_own(
     return _sealed(dataset, out, config, observations, calibration, said)
 
 
-class _Said(NamedTuple):
+@dataclass(frozen=True)
+class _Said:
     """What a run says, to be sealed."""
 
     signals: dict[str, np.ndarray]

@@ -133,6 +133,9 @@ def _judge(dataset: Path, out: Path, config: "Config") -> None:
     evaluation = evaluate(out, dataset / "truth", config)
     print("\n".join(evaluation.sentences))
     say(f"report: {out}/report.html")
+    if "own_gap_m" in evaluation.judgement.manifest:
+        say(f"next:   taojax closures {out}; taojax graph {out}")
+        return
     wrong = (evaluation.judgement.outcome == "accepted_wrong").nonzero()[0]
     frame = wrong[-1] if wrong.size else len(evaluation.judgement.outcome) - 1
     say(f"next:   taojax explain {out} --frame {frame}; taojax closures {out}")
