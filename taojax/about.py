@@ -23,6 +23,10 @@ class About(NamedTuple):
     trial_frames: int | None = None
     """The log is a row of trials of so many frames, each with a fresh start; None = one log."""
 
+    own_gap_m: float | None = None
+    """The drive is its own map: a frame knows those that lie so much way behind it, metres;
+    None = the map is another drive."""
+
 
 def read_about(folder: Path, n_query: int | None = None) -> About:
     """Read about.toml; a folder without one says nothing.
@@ -44,6 +48,13 @@ def read_about(folder: Path, n_query: int | None = None) -> About:
     notes, frames = about.get("notes", []), about.get("trial_frames")
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         raise fail(path, "notes is not a list of sentences", "expected notes = [...]")
+    gap_m = about.get("own_gap_m")
+    if gap_m is not None:
+        if type(gap_m) not in (int, float) or not gap_m > 0 or frames is not None:
+            what = f"own_gap_m is {gap_m!r}"
+            fix = "expected metres of way, more than 0, in a folder without trial_frames"
+            raise fail(path, what, fix)
+        return About(tuple(notes), own_gap_m=float(gap_m))
     if frames is None:
         return About(tuple(notes))
     if type(frames) is not int or frames < 1 or (n_query or frames) % frames:

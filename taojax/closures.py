@@ -1,11 +1,13 @@
 """Loop closures as files that other tools read: g2o for pose graphs, TUM for trajectories.
 
-Ids of the graph: map row m is vertex m, query frame t is vertex M + t. Every edge is an EDGE_SE2:
+Ids of the graph: map row m is vertex m, query frame t is vertex M + t; of one drive that closes on
+itself frame t is vertex t. Every edge is an EDGE_SE2:
 the pose of the second vertex in axes of the first, then the upper triangle of its information
 matrix. There are no comments and no FIX lines, which some readers refuse.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +25,7 @@ from taojax.tables import MOTION, POSE, read_frames, read_table, stacked
 __all__ = [
     "Graph",
     "Verdicts",
+    "as_verdicts",
     "between",
     "build_graph",
     "compose",
@@ -106,6 +109,8 @@ class Graph(NamedTuple):
     """Of an angle: the Huber threshold over the length of a window."""
 
     spacing_m: float
+    is_own: bool = False
+    """Map row m is query frame m: one drive that closes on itself."""
 
     def rows(self, verdict: str) -> Int[np.ndarray, " c"]:
         """Return the frames with one verdict and a pose."""
@@ -149,8 +154,19 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
         path, numbers, table = folder / "decisions.csv", folder / "detector.toml", run.decisions
     else:
         return None
+    return as_verdicts(path.name, table, read_calibration(numbers))
+
+
+def as_verdicts(source: str, table: Mapping[str, np.ndarray], numbers: Calibration) -> Verdicts:
+    """Return verdicts from the columns of verdicts.csv.
+
+    Args:
+        source: the file that says so.
+        table: its columns.
+        numbers: the frozen ones behind them.
+    """
     return Verdicts(
-        path.name,
+        source,
         table["verdict"],
         table["probability_wrong"],
         table["reason"],
@@ -160,7 +176,7 @@ def read_verdicts(folder: Path, run: Run) -> Verdicts | None:
         table["probability_wrong_now"],
         table["reason_now"],
         stacked(table, ("x_now_m", "y_now_m", "theta_now_rad")),
-        read_calibration(numbers),
+        numbers,
     )
 
 
@@ -252,6 +268,7 @@ def build_graph(folder: Path, run: Run, verdicts: Verdicts) -> Graph:
         sigma_m=sigma_m,
         sigma_rad=sigma_rad,
         spacing_m=spacing_m,
+        is_own="own_gap_m" in facts,
     )
 
 
@@ -299,24 +316,27 @@ def g2o_text(graph: Graph, verdict: str) -> str:
         verdict: accept, or reject for a graph to compare with; never optimise that one.
 
     Returns:
-        A g2o file. The information matrix of a closure is the inverse of the covariance that it
-        carries, turned into the axes of its pose; the map's own edges are `MAP_STIFFNESS` times
-        tighter than the Huber threshold (3 map spacings) in standard deviation; an odometry edge
-        takes 10 % of its length, at least 1 % of the spacing, and `ODOMETRY_RAD`. Put your own
-        covariance there if you have one.
+        A g2o file; one drive that closes on itself has its frames alone for vertices, where its
+        odometry has put them. The information matrix of a closure is the inverse of the covariance
+        that it carries, turned into the axes of its pose; the map's own edges are `MAP_STIFFNESS`
+        times tighter than the Huber threshold (3 map spacings) in standard deviation; an odometry
+        edge takes 10 % of its length, at least 1 % of the spacing, and `ODOMETRY_RAD`. Put your
+        own covariance there if you have one.
     """
     n_map, n_query = len(graph.map_pose), len(graph.query_pose)
     rows, after = graph.rows(verdict), np.flatnonzero(~graph.is_start)
     driven = np.hypot(graph.odometry[after, 0], graph.odometry[after, 1])
     slack = np.maximum(ODOMETRY_SHARE * driven, LEAST_SPACINGS * graph.spacing_m)
     m, place = np.arange(n_map), graph.map_index[rows]
-    lines = [
-        *_lines("VERTEX_SE2", m, graph.map_pose),
-        *_lines("VERTEX_SE2", n_map + np.arange(n_query), graph.query_pose),
-        *_edges(
-            m[:-1], m[1:], between(graph.map_pose[:-1], graph.map_pose[1:]),
-            _diagonal(n_map - 1, graph.sigma_m / MAP_STIFFNESS, graph.sigma_rad / MAP_STIFFNESS),
-        ),
+    lines = _lines("VERTEX_SE2", m, graph.map_pose)
+    if graph.is_own:
+        n_map = 0
+    else:
+        stiff = graph.sigma_m / MAP_STIFFNESS, graph.sigma_rad / MAP_STIFFNESS
+        along = between(graph.map_pose[:-1], graph.map_pose[1:])
+        lines += _lines("VERTEX_SE2", n_map + np.arange(n_query), graph.query_pose)
+        lines += _edges(m[:-1], m[1:], along, _diagonal(n_map - 1, *stiff))
+    lines += [
         *_edges(
             n_map + after - 1, n_map + after, graph.odometry[after],
             _diagonal(len(after), slack, ODOMETRY_RAD),

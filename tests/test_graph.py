@@ -418,6 +418,38 @@ def test_the_truth_of_the_test_half_moves_no_trajectory_but_the_oracles(rng):
         assert same == (one.method != judge.ORACLE)
 
 
+@needs_gtsam
+@pytest.mark.parametrize(
+    ("ours", "every", "best", "words"),
+    [
+        ((99, 0.0, 1.0, 0.0), (0.8, 44.0), (0.0, 0.9), ("stays whole: 1 m", "GNC it breaks: 44 m")),
+        ((99, 0.1, 50.0, 0.7), (0.0, 1.0), (0.0, 0.9),
+         ("these closures the graph breaks", "it stays whole", "which is better here")),
+        ((9, 0.0, 20.0, 0.6), (0.8, 44.0), (0.0, 0.9), ("None of these closures is wrong",)),
+        ((9, 0.0, 5.0, 0.3), (0.32, 6.0), (0.3, 5.0), ("as whole as the right ones alone", "kept")),
+        ((9, 0.0, 30.0, 0.8), (0.9, 44.0), (0.8, 30.0), ("do not hold the graph, nor do",)),
+        ((0, np.nan, 30.0, 0.8), (0.9, 44.0), (0.0, 1.0), ("The graph is odometry alone (",)),
+    ],
+)  # fmt: skip
+def test_the_one_sentence_is_honest(ours, every, best, words, rng):
+    run, truth = made_up(rng, accepted=np.arange(240) < (0 if ours[0] == 0 else 240))
+    judged = judge.judge_graph(run, truth[:, :2], AuditConfig(r_in_m=3.0, r_out_m=3.0), 10, None)
+    assert [o.method for o in judged.outcomes] == ["top1_gnc", "ours", "oracle"]
+    table = {name: values.copy() for name, values in judged.table.items()}
+    told = {
+        "ours": dict(zip(("closures", "wrong_share", "median_m", "off_share"), ours, strict=True)),
+        "top1_gnc": dict(zip(("off_share", "median_m"), every, strict=True)),
+        "oracle": dict(zip(("off_share", "median_m"), best, strict=True)),
+    }
+    for at, name in enumerate(table["method"]):
+        for column, value in told[name].items():
+            table[column][at] = value
+    said = judge.headline(judged._replace(table=table))
+    for word in words:
+        assert word in said
+    assert ("which is better here" in said) == ("which is better here" in words)
+
+
 def test_a_gate_lets_through_as_many_as_the_promise_allows():
     similarity = np.array([0.9, 0.8, 0.7, 0.7, 0.6, -np.inf])
     is_wrong = np.array([False, False, True, False, False, True])
@@ -462,6 +494,27 @@ def test_the_command_writes_table_picture_and_page(audited, tmp_path, capsys):
     page = (tmp_path / "graph.html").read_text()
     assert "Odometry noise" in page
     assert "data:image/svg+xml" in page
+
+
+@needs_gtsam
+def test_the_report_says_and_draws_what_became_of_the_graph(audited):
+    page = (audited / "run/report.html").read_text()
+    assert "with all first candidates and GNC it" in page
+    assert "What the closures do to the graph" in page
+    head = (audited / "run/figures/graph_brief.csv").read_text().splitlines()[0]
+    assert head == (
+        "frame,true_x_m,true_y_m,top1_gnc_x_m,top1_gnc_y_m,ours_x_m,ours_y_m,oracle_x_m,oracle_y_m"
+    )
+
+
+def test_without_the_extra_the_report_says_how_to_get_it(audited, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(judge, "has_extra", lambda: False)
+    run, truth = str(audited / "run"), str(audited / "data/truth")
+    assert main(["evaluate", run, "--truth", truth, "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert said.count("python -m pip install 'taojax[graph]'") == 1
+    assert "taojax[graph]" in (tmp_path / "report.html").read_text()
+    assert not (tmp_path / "figures/graph_brief.png").exists()
 
 
 def test_a_missing_extra_is_told_with_the_command_that_installs_it(audited, monkeypatch, capsys):

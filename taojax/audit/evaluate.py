@@ -5,15 +5,19 @@ import json
 from pathlib import Path
 
 from taojax.audit import figures, report, tables
+from taojax.audit.graph import in_brief
 from taojax.audit.judgement import Evaluation, Judgement, judge
+from taojax.audit.own_map import in_truth
 from taojax.audit.paste import paste_files
 from taojax.audit.truth import Truth, read_truth
 from taojax.audit.words import find_words
+from taojax.closures import as_verdicts
 from taojax.config import Config
 from taojax.records import read_run
 from taojax.risk import to_toml
 from taojax.specs import write_atomically
-from taojax.tables import table_text
+from taojax.tables import read_table, table_text
+from taojax.verdicts import decide
 
 __all__ = ["Evaluation", "evaluate"]
 
@@ -72,11 +76,20 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
     """
     sealed = read_run(run)
     known = read_truth(truth, len(sealed.signals["frame"]))
-    judgement = judge(sealed, known, config)
-    pictures = figures.draw(judgement)
+    moved, nearest = sealed, None
+    if "own_gap_m" in sealed.manifest:
+        moved, nearest = in_truth(sealed, known, read_table(run / "odometry.csv", "query_odometry"))
+    judgement = judge(moved, known, config, nearest)
+    decided = judgement.verdicts
+    if moved is not sealed:
+        # The same verdicts, with answers where the run has put them.
+        decided = decide(judgement.calibration, sealed.signals, sealed.delayed)
+    numbers = as_verdicts("verdicts.csv", decided, judgement.calibration)
+    graph = in_brief(run, sealed, numbers, known, config.audit, config.stream.window)
+    pictures = (*([graph.picture] if graph.picture else []), *figures.draw(judgement))
     files: dict[str, str | bytes] = {
         "labels.csv": table_text("labels", _labels(judgement)),
-        "verdicts.csv": table_text("verdicts", judgement.verdicts),
+        "verdicts.csv": table_text("verdicts", decided),
         "metrics.csv": table_text("metrics", judgement.metrics),
         "audit.json": _settings(judgement, known),
     }
@@ -87,11 +100,17 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
         files |= tables.as_files(name, getattr(judgement, name))
     for drawn in pictures:
         files |= figures.as_files(drawn)
+    found = find_words(judgement)
+    # What was found first, then what it does to the graph.
+    at = 1 if graph.is_lead else len(found)
+    said = (graph.sentence,) if graph.sentence else ()
     done = Evaluation(
         run=run,
         judgement=judgement,
-        sentences=find_words(judgement),
+        sentences=(*found[:at], *said, *found[at:]),
         command=_command(run, truth, config),
+        lead=said if graph.is_lead else (),
+        warnings=said if graph.is_alarm else (),
     )
     files |= paste_files(judgement, done.command)
     files["report.html"] = report.run_page(done, pictures)

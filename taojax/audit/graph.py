@@ -15,16 +15,36 @@ from matplotlib.figure import Figure
 from taojax import plots
 from taojax.audit import figures, labels, tables
 from taojax.audit.figures import Picture, csv_text, picture
+from taojax.audit.own_map import nearest_known
 from taojax.audit.page import Page, grid, render
-from taojax.audit.truth import read_truth
+from taojax.audit.truth import Truth, read_truth
+from taojax.closures import Verdicts, compose
 from taojax.config import AuditConfig
 from taojax.graph.answers import Closure, Run2D, Stream, read_answers
-from taojax.graph.methods import Outcome, Problem, build, optimise, optimise_all
+from taojax.graph.methods import (
+    ALONE,
+    Outcome,
+    Problem,
+    build,
+    optimise,
+    optimise_all,
+    optimise_few,
+)
+from taojax.graph.optimise import INSTALL, has_extra
 from taojax.records import Run
 from taojax.specs import write_atomically
 from taojax.verdicts import plain
 
-__all__ = ["Judged", "judge_graph", "sentences", "write_graph"]
+__all__ = [
+    "Brief",
+    "Judged",
+    "draw",
+    "headline",
+    "in_brief",
+    "judge_graph",
+    "sentences",
+    "write_graph",
+]
 
 MOST_WRONG = 0.05
 """Share of wrong answers that the similarity gate may let through on the calibration half: the
@@ -34,6 +54,15 @@ WHOLE = 0.05
 """A graph is whole if at most so much more of the test frames are off than with the oracle."""
 
 ORACLE = "oracle"
+
+RIVAL = "top1_gnc"
+"""What the one sentence compares with: the back-end that is told to survive wrong closures."""
+
+LOST = 0.5
+"""Where the right closures alone leave more of the test frames off, nothing was held."""
+
+LITTLE = 0.001
+"""Shares of frames closer than this are told as equal."""
 
 COLUMNS = 4
 """Panels side by side in the picture."""
@@ -63,7 +92,7 @@ class Judged(NamedTuple):
     """What odometry is believed to do, in words."""
 
     gate: str
-    """Where the similarity gate lies, in words."""
+    """Where the similarity gate lies, in words; empty where it was not tried."""
 
     r_out_m: float
     frames: tuple[int, int]
@@ -72,6 +101,9 @@ class Judged(NamedTuple):
     map_m: Float[np.ndarray, "m 2"]
     truth_m: Float[np.ndarray, "n 2"]
     """Of the test frames, metres."""
+
+    paths_m: tuple[Float[np.ndarray, "n 2"], ...]
+    """Per method: optimised positions of the test frames."""
 
     wrong: tuple[Float[np.ndarray, "_ 2 2"], ...]
     """Per method: true and answered position of its wrong closures, metres."""
@@ -99,25 +131,49 @@ def gate_level(
     return float(similarity[order[good[-1]]]) if good.size else float("inf")
 
 
-def _errors(stream: Stream, truth_m: np.ndarray) -> np.ndarray:
+def _errors(stream: Stream, truth: np.ndarray) -> np.ndarray:
     """Return distances from answers to the truth (n,), metres; NaN without an answer."""
-    return np.hypot(*(stream.pose[: len(truth_m), :2] - truth_m).T)
+    pose = stream.pose[: len(truth)]
+    if stream.anchor is not None and stream.motion is not None:
+        row = stream.anchor[: len(truth)]
+        led = compose(truth[np.maximum(row, 0)], stream.motion[: len(truth)])
+        pose = np.where((row >= 0)[:, None], led, np.nan)
+    return np.hypot(*(pose[:, :2] - truth[:, :2]).T)
 
 
-def _is_wrong(closure: Closure, truth_m: np.ndarray, r_out_m: float) -> bool:
-    return bool(np.hypot(*(closure.pose[:2] - truth_m[closure.frame])) > r_out_m)
+def _answered_m(closure: Closure, truth: np.ndarray) -> np.ndarray:
+    """Return where a closure says the robot was: on the map, or from the true place it names."""
+    if closure.tie is None:
+        return closure.pose[:2]
+    return compose(truth[closure.tie.frame], closure.tie.motion)[:2]
+
+
+def _is_wrong(closure: Closure, truth: np.ndarray, r_out_m: float) -> bool:
+    away = _answered_m(closure, truth) - truth[closure.frame, :2]
+    return bool(np.hypot(*away) > r_out_m)
+
+
+def _laid(path: np.ndarray, truth_m: np.ndarray) -> np.ndarray:
+    """Lay a trajectory that floats rigidly on the truth: least squared distances, (n, 2).
+
+    Umeyama, Least-squares estimation of transformation parameters, PAMI 1991, without scale.
+    """
+    a, b = path[:, 0] + 1j * path[:, 1], truth_m[:, 0] + 1j * truth_m[:, 1]
+    turn = np.exp(1j * np.angle(np.vdot(a - a.mean(), b - b.mean())))
+    laid = turn * (a - a.mean()) + b.mean()
+    return np.stack([laid.real, laid.imag], axis=1)
 
 
 def _row(
     outcome: Outcome,
-    first: int,
-    truth_m: np.ndarray,
+    path_m: np.ndarray,
+    truth: np.ndarray,
     label: np.ndarray,
     r_out_m: float,
 ) -> dict[str, Any]:
-    error = np.hypot(*(outcome.solution.pose[:, :2] - truth_m[first:]).T)
+    error = np.hypot(*(path_m - truth[-len(path_m) :, :2]).T)
     is_off, inside = error > r_out_m, label == "in_map"
-    wrong = [_is_wrong(closure, truth_m, r_out_m) for closure in outcome.closures]
+    wrong = [_is_wrong(closure, truth, r_out_m) for closure in outcome.closures]
     median, p95 = np.percentile(error, (50, 95))
     row = {
         "method": outcome.method, "closures": len(wrong), "rmse_m": np.sqrt(np.mean(error**2)),
@@ -140,60 +196,75 @@ def _split(n: int, audit: AuditConfig, gap_frames: int) -> Shaped[np.ndarray, " 
     return cut.name
 
 
-def _gated(run: Run2D, truth_m: np.ndarray, r_out_m: float) -> tuple[float, str]:
-    """Set the gate with the truth of the calibration half, `truth_m` (n, 2)."""
-    error = _errors(run.answers.top1, truth_m)
-    level = gate_level(run.answers.similarity[: len(truth_m)], ~(error <= r_out_m), MOST_WRONG)
+def _gated(run: Run2D, truth: np.ndarray, r_out_m: float) -> tuple[float, str]:
+    """Set the gate with the truth of the calibration half alone."""
+    error = _errors(run.answers.top1, truth)
+    level = gate_level(run.answers.similarity[: len(truth)], ~(error <= r_out_m), MOST_WRONG)
     share = f"at most {100 * MOST_WRONG:g} % of the calibration answers"
     if np.isinf(level):
         return level, f"Similarity gate: shut, for no level keeps {share} from being wrong."
     return level, f"Similarity gate: {plain(level)}, above which {share} are wrong."
 
 
-def _oracle(problem: Problem, run: Run2D, truth_m: np.ndarray, r_out_m: float) -> Outcome:
-    top1, first = run.answers.top1, problem.chain.first
-    right = top1.accepted & (_errors(top1, truth_m) <= r_out_m)
+def _oracle(problem: Problem, run: Run2D, truth: np.ndarray, r_out_m: float) -> Outcome:
+    top1, first = run.answers.top1, problem.first
+    right = top1.accepted & (_errors(top1, truth) <= r_out_m)
     right[:first] = False
     return optimise(problem, ORACLE, top1.closures(right), "plain")
 
 
 def judge_graph(
     run: Run2D,
-    truth_m: Float[np.ndarray, "t 2"],
+    truth: Float[np.ndarray, "t _"],
     audit: AuditConfig,
     gap_frames: int,
-    say: Callable[[str], None] = lambda text: None,
+    say: Callable[[str], None] | None = lambda text: None,
 ) -> Judged | None:
     """Optimise the graph of the test half in every way, then hold the results against the truth.
 
     Args:
         run: from `read_answers`.
-        truth_m: true positions of all frames, metres.
+        truth: true positions of all frames, metres; and headings [rad], which one drive that
+            closes on itself needs.
         audit: radii and split.
         gap_frames: between calibration and test half; also the window.
-        say: told what is being optimised.
+        say: told what is being optimised; None optimises only what the one sentence needs.
 
     Returns:
         None where the recording is too short to hold a test half.
     """
-    split = _split(len(truth_m), audit, gap_frames)
+    split = _split(len(truth), audit, gap_frames)
     if not (split == "test").any():
         return None
     end, first = int((split == "calibration").sum()), int(np.argmax(split == "test"))
     problem = build(run, calibration_end=end, first=first, window=gap_frames)
-    gate, said = _gated(run, truth_m[:end], audit.r_out_m)
-    found = optimise_all(problem, gate, say)
+    if say is None:
+        said, found = "", optimise_few(problem)
+    else:
+        gate, said = _gated(run, truth[:end], audit.r_out_m)
+        found = optimise_all(problem, gate, say)
     # From here on the truth of the test half is known.
-    found.append(_oracle(problem, run, truth_m, audit.r_out_m))
-    map_m = run.map_pose[:, :2]
-    nearest = labels.nearest_map_distance(truth_m[first:], map_m)
+    found.append(_oracle(problem, run, truth, audit.r_out_m))
+    truth_m = truth[:, :2]
+    paths = [o.solution.pose[:, :2] for o in found]
+    if run.is_own:
+        # Nothing says where the drive lies but itself.
+        paths = [_laid(path, truth_m)[first:] for path in paths]
+        nearest = nearest_known(truth_m, run.odometry, run.own_gap_m)[first:]
+        map_m = truth_m
+    else:
+        map_m = run.map_pose[:, :2]
+        nearest = labels.nearest_map_distance(truth_m[first:], map_m)
     label = labels.label_frames(nearest, audit.r_in_m, audit.r_out_m)
-    rows = [_row(outcome, first, truth_m, label, audit.r_out_m) for outcome in found]
+    rows = [
+        _row(outcome, path, truth, label, audit.r_out_m)
+        for outcome, path in zip(found, paths, strict=True)
+    ]
     wrong = tuple(
         np.array([
-            (truth_m[c.frame], c.pose[:2])
+            (truth_m[c.frame], _answered_m(c, truth))
             for c in outcome.closures
-            if _is_wrong(c, truth_m, audit.r_out_m)
+            if _is_wrong(c, truth, audit.r_out_m)
         ]).reshape(-1, 2, 2)
         for outcome in found
     )  # fmt: skip
@@ -206,6 +277,7 @@ def judge_graph(
         frames=(first, len(truth_m) - 1),
         map_m=map_m,
         truth_m=truth_m[first:],
+        paths_m=tuple(paths),
         wrong=wrong,
     )
 
@@ -219,47 +291,89 @@ def _measured(row: dict[str, Any]) -> str:
     return f"{plain(row['median_m'])} m median, {100 * row['off_share']:.1f} % of the frames off"
 
 
-def _headline(judged: Judged) -> str:
-    """Return the one sentence."""
-    ours, every, best = (_of(judged, name) for name in ("ours", "top1_huber", ORACLE))
-    most = best["off_share"] + WHOLE
+def _fate(row: dict[str, Any], best: dict[str, Any]) -> str:
+    """Say what became of a graph, measured by what the right closures alone make of it.
+
+    Returns:
+        whole; kept, as far as the right ones keep it; lost, as it is with them; broken; or drifts,
+        where too few closures hold it but none of them is wrong.
+    """
+    if row["off_share"] <= WHOLE:
+        return "whole"
+    if row["off_share"] > best["off_share"] + WHOLE:
+        return "broken" if row["wrong_share"] > 0 else "drifts"
+    return "kept" if best["off_share"] <= LOST else "lost"
+
+
+def is_whole(judged: Judged) -> bool:
+    """Return whether our closures break nothing that the right ones alone would hold."""
+    return _fate(_of(judged, "ours"), _of(judged, ORACLE)) not in ("broken", "drifts")
+
+
+def headline(judged: Judged) -> str:
+    """Return the one sentence: our closures, all first candidates, and the right ones alone."""
+    ours, every, best = (_of(judged, name) for name in ("ours", RIVAL, ORACLE))
     if not ours["closures"]:
         note = next(o.note for o in judged.outcomes if o.method == "ours")
-        start = f"The graph is odometry alone ({note}): {_measured(ours)}"
-    elif ours["off_share"] <= most:
-        start = f"With these closures the graph stays whole: {_measured(ours)}"
+        start = f"The graph is odometry alone ({note.removeprefix(ALONE)})"
     else:
-        start = f"With these closures the graph does not stay whole: {_measured(ours)}"
-    fate = "it holds too" if every["off_share"] <= most else "it breaks"
+        start = {
+            "whole": "With these closures the graph stays whole",
+            "kept": "With these closures the graph stays as whole as the right ones alone keep it",
+            "lost": "These closures do not hold the graph, nor do the right ones alone",
+            "broken": "With these closures the graph breaks",
+            "drifts": "None of these closures is wrong, but where none holds the graph it drifts",
+        }[_fate(ours, best)]
+    fate = {
+        "whole": "stays whole", "kept": "is kept too", "lost": "does not hold", "broken": "breaks",
+        "drifts": "drifts",
+    }  # fmt: skip
+    rival = fate[_fate(every, best)]
+    gap = ours["off_share"] - every["off_share"]
+    is_behind = gap > LITTLE or (abs(gap) <= LITTLE and ours["median_m"] > every["median_m"])
+    right = (
+        f"with the right ones alone: {_measured(best)}"
+        if best["closures"]
+        else "none of the first candidates is right"
+    )
     return (
-        f"{start}; with all first candidates under a Huber kernel {fate}: {_measured(every)}; with "
-        f"the right ones alone: {_measured(best)}. Off means more than {judged.r_out_m:g} m, on "
-        f"the test frames {judged.frames[0]} to {judged.frames[1]}."
+        f"{start}: {_measured(ours)}; with all first candidates and GNC it {rival}: "
+        f"{_measured(every)}{', which is better here' if is_behind else ''}; {right}. Off means "
+        f"more than {judged.r_out_m:g} m, on the test frames {judged.frames[0]} to "
+        f"{judged.frames[1]}."
     )
 
 
 def sentences(judged: Judged) -> tuple[str, ...]:
     """Return what was found, most important first."""
     notes = [f"{TITLES[o.method]}: {o.note}." for o in judged.outcomes if o.note]
-    return (_headline(judged), judged.noise, judged.gate, *dict.fromkeys(notes))
+    gate = [judged.gate] if judged.gate else []
+    return (headline(judged), judged.noise, *gate, *dict.fromkeys(notes))
 
 
-def draw(judged: Judged) -> Picture:
-    """Draw the trajectory of every method on the map."""
+def draw(judged: Judged, name: str = "graph") -> Picture:
+    """Draw the trajectory of every method on the map.
+
+    Args:
+        judged: what became of each.
+        name: of the picture's files.
+    """
     n = len(judged.outcomes)
-    n_rows = -(-n // COLUMNS)
+    across = min(n, COLUMNS)
+    n_rows = -(-n // across)
     wide, high = plots.map_size(judged.map_m, judged.truth_m, wide_in=3.4, most_in=3.0)
-    size = (wide * COLUMNS, (high - plots.BELOW_MAP_IN + 0.55) * n_rows + 0.6)
+    size = (wide * across, (high - plots.BELOW_MAP_IN + 0.55) * n_rows + 0.6)
     figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(n_rows, COLUMNS, squeeze=False).ravel()
+    axes = figure.subplots(n_rows, across, squeeze=False).ravel()
     columns = {
         "frame": np.arange(judged.frames[0], judged.frames[1] + 1),
         "true_x_m": judged.truth_m[:, 0],
         "true_y_m": judged.truth_m[:, 1],
     }
     lines: dict[str, Any] = {}
-    for ax, outcome, wrong in zip(axes, judged.outcomes, judged.wrong, strict=False):
-        path = outcome.solution.pose[:, :2]
+    for ax, outcome, path, wrong in zip(
+        axes, judged.outcomes, judged.paths_m, judged.wrong, strict=False
+    ):
         plots.graph_map(judged.map_m, judged.truth_m, path, wrong, ax=ax)
         row = _of(judged, outcome.method)
         said = f"{plain(row['median_m'])} m median, {len(wrong)} of {row['closures']:.0f} wrong"
@@ -279,7 +393,64 @@ def draw(judged: Judged) -> Picture:
         "closures. A wrong closure pulls the trajectory from where the robot was to where the "
         "answer lies. Trajectories may leave the frame."
     )
-    return picture(figure, "graph", "What the closures do to the graph", caption, csv_text(columns))
+    return picture(figure, name, "What the closures do to the graph", caption, csv_text(columns))
+
+
+def _truth(known: Truth) -> np.ndarray:
+    return np.column_stack([known.xy_m, known.theta_rad])
+
+
+class Brief(NamedTuple):
+    """What the report of a run says of the graph."""
+
+    sentence: str
+    """Empty where there is no graph to speak of."""
+
+    picture: Picture | None = None
+    is_lead: bool = False
+    """Whether it was measured, and belongs on the first screen."""
+
+    is_alarm: bool = False
+
+
+LACKS = (
+    f"What these closures do to a pose graph is not said here: it needs GTSAM ({INSTALL}, then "
+    "judge again or run `taojax graph`)."
+)
+"""Said where the extra is missing."""
+
+
+def in_brief(
+    folder: Path,
+    sealed: Run,
+    verdicts: Verdicts,
+    known: Truth,
+    audit: AuditConfig,
+    gap_frames: int,
+) -> Brief:
+    """Optimise the graph of a run with three methods alone, and say what became of it.
+
+    Args:
+        folder: the run.
+        sealed: read from it by `records.read_run`.
+        verdicts: what was decided.
+        known: the truth of the same recording.
+        audit: radii and split.
+        gap_frames: between calibration and test half.
+
+    Returns:
+        One sentence and the picture; how to get them without the extra; nothing where the run
+        holds no odometry or no test half.
+    """
+    if "odometry.csv" not in sealed.manifest["sha256"] or "map_spacing_m" not in sealed.manifest:
+        return Brief("")
+    if not has_extra():
+        return Brief(LACKS)
+    run = read_answers(folder, sealed, verdicts)
+    judged = judge_graph(run, _truth(known), audit, gap_frames, None)
+    if judged is None:
+        return Brief("")
+    return Brief(headline(judged), draw(judged, "graph_brief"), True, not is_whole(judged))
 
 
 def _page(judged: Judged, drawn: Picture, facts: dict[str, str], command: str) -> str:
@@ -332,7 +503,7 @@ def write_graph(  # noqa: PLR0913 - a run, its truth, how it is judged, where it
     """
     run = read_answers(folder, sealed)
     known = read_truth(truth, len(run.odometry))
-    judged = judge_graph(run, known.xy_m, audit, gap_frames, say)
+    judged = judge_graph(run, _truth(known), audit, gap_frames, say)
     if judged is None:
         return ("The recording is too short to hold a test half: there is no graph to judge.",)
     drawn = draw(judged)

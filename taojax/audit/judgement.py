@@ -87,20 +87,24 @@ def _outcomes(verdict: np.ndarray, label: np.ndarray, own: risk.Own) -> np.ndarr
     return np.where(verdict == "abstain", "abstained", outcome)
 
 
-def judge(run: Run, truth: Truth, config: Config) -> Judgement:
+def judge(
+    run: Run, truth: Truth, config: Config, nearest_m: Float[np.ndarray, " t"] | None = None
+) -> Judgement:
     """Judge a sealed run.
 
     Args:
         run: verified by `records.read_run`.
         truth: of the same recording.
         config: radii, split, thresholds and resamples; the window sets the gap.
+        nearest_m: distance of each frame to the nearest map pose that it may know, metres; to the
+            nearest of all when omitted.
 
     Returns:
         Labels, verdicts and tables.
     """
     audit = config.audit
     map_m = np.stack([run.map_poses["x_m"], run.map_poses["y_m"]], axis=1)
-    nearest = labels.nearest_map_distance(truth.xy_m, map_m)
+    nearest = labels.nearest_map_distance(truth.xy_m, map_m) if nearest_m is None else nearest_m
     label = labels.label_frames(nearest, audit.r_in_m, audit.r_out_m)
     signals = {name: run.signals[name] for name in signal_names()}
 
@@ -192,3 +196,9 @@ class Evaluation(NamedTuple):
 
     command: str
     """How to repeat the judging."""
+
+    lead: tuple[str, ...] = ()
+    """Sentences on the graph that belong on the first screen; some of `sentences`."""
+
+    warnings: tuple[str, ...] = ()
+    """Those of them that should alarm."""

@@ -161,7 +161,8 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
     judgement = done.judgement
     audit = judgement.config.audit
     dataset = judgement.manifest.get("dataset", done.run)
-    lead = lead_words(judgement)
+    first, *others = lead_words(judgement)
+    lead = (first, *done.lead, *others)
     # Its hash was checked before the judge began.
     found = read_npz(done.run / "retrievals.npz", "retrievals")
     return render(
@@ -183,7 +184,7 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
             command=done.command,
             words=glossary(),
             terms=_terms(),
-            warnings=warnings(judgement),
+            warnings=(*warnings(judgement), *done.warnings),
             route=route_json(judgement, found["index"], found["similarity"]),
         )
     )
@@ -192,6 +193,7 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
 def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> list[str]:
     said = []
     for name, done in summary.cut_maps(scenarios).items():
+        said += [f"{name}: {sentence}" for sentence in done.lead]
         tao, top1 = (metric_row(done.judgement, s) for s in ("tao", "top1"))
         far = rates_of(done.judgement)[VERDICT_FAR]
         said.append(

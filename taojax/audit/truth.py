@@ -17,6 +17,7 @@ class Truth(NamedTuple):
     t_s: Float[np.ndarray, " t"]
     xy_m: Float[np.ndarray, "t 2"]
     sha256: str
+    theta_rad: Float[np.ndarray, " t"]
 
 
 def read_truth(path: Path, n_rows: int) -> Truth:
@@ -39,7 +40,7 @@ def read_truth(path: Path, n_rows: int) -> Truth:
         fix = "give the truth of the same recording"
         raise InputError(f"{file}: {n} poses for a run of {n_rows} frames; {fix}")
     xy = np.stack([table["x_m"], table["y_m"]], axis=1)
-    return Truth(t_s=table["t_s"], xy_m=xy, sha256=digest_file(file))
+    return Truth(t_s=table["t_s"], xy_m=xy, sha256=digest_file(file), theta_rad=table["theta_rad"])
 
 
 class Trials(NamedTuple):

@@ -42,12 +42,25 @@ class Places(eqx.Module):
     unit_m: Float[Array, ""]
     """Way over which one whole piece of evidence is gathered."""
 
+    n_known: Float[Array, ""]
+    """Anchors that exist; rows from there on are padding, without mass for ever."""
 
-def uninformed(config: VerdictConfig, n_anchors: int) -> Belief:
-    """Return the belief before any frame: anywhere."""
+
+def uninformed(
+    config: VerdictConfig, n_anchors: int, n_known: Float[Array, ""] | None = None
+) -> Belief:
+    """Return the belief before any frame: anywhere.
+
+    Args:
+        config: the prior of being off the map.
+        n_anchors: rows.
+        n_known: how many of them exist; all when omitted.
+    """
     # Explicit types: a weakly typed start would compile the second step again.
     off = jnp.asarray(config.start_off, jnp.float32)
-    return Belief(jnp.ones((2, n_anchors), jnp.float32) * ((1.0 - off) / (2 * n_anchors)), off)
+    n = jnp.asarray(n_anchors if n_known is None else n_known, jnp.float32)
+    is_known = (jnp.arange(n_anchors, dtype=jnp.float32) < n).astype(jnp.float32)
+    return Belief(jnp.broadcast_to(is_known * ((1.0 - off) / (2 * n)), (2, n_anchors)), off)
 
 
 def _spread(
@@ -102,7 +115,7 @@ def predict(
         The belief after it. What would have come from outside the map is off it now.
     """
     grid, gap_m = places.grid, places.gap_m
-    m = grid.xy.shape[0]
+    is_known = jnp.arange(grid.xy.shape[0], dtype=jnp.float32) < places.n_known
     driven = jnp.sqrt(motion[0] ** 2 + motion[1] ** 2)
     units = jnp.minimum(1.0, driven / places.unit_m)
     stays_on = (1.0 - config.leave) ** units
@@ -128,7 +141,8 @@ def predict(
     arriving = jnp.where(is_linked, stays_on * arriving, 0.0)
     gone = jnp.maximum(1.0 - belief.off - jnp.sum(arriving), 0.0)
     back = (1.0 - stays_off) * belief.off
-    return _normalised(arriving + back / (2 * m), belief.off - back + gone)
+    anywhere = jnp.where(is_known, back / (2 * places.n_known), 0.0)
+    return _normalised(arriving + anywhere[None], belief.off - back + gone)
 
 
 def _normalised(mass: Float[Array, "2 m"], off: Float[Array, ""]) -> Belief:
@@ -151,15 +165,21 @@ def weigh(belief: Belief, index: Int[Array, " c"], log_evidence: Float[Array, " 
     return _normalised(belief.mass * evidence[None], belief.off)
 
 
-def combined(config: VerdictConfig, forward: Belief, backward: Belief) -> Belief:
+def combined(
+    config: VerdictConfig,
+    forward: Belief,
+    backward: Belief,
+    n_known: Float[Array, ""] | None = None,
+) -> Belief:
     """Return the smoothed belief of a frame.
 
     Args:
         config: the prior that both halves contain.
         forward: from all frames up to this one.
         backward: from the frames after this one, carried back to it.
+        n_known: anchors that exist; all rows when omitted.
     """
-    m = forward.mass.shape[1]
+    m = forward.mass.shape[1] if n_known is None else n_known
     on = jnp.maximum(1.0 - config.start_off, _TINY) / (2 * m)
     off = jnp.maximum(config.start_off, _TINY)
     return _normalised(forward.mass * backward.mass / on, forward.off * backward.off / off)

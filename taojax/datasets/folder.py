@@ -64,7 +64,7 @@ class Lists:
     """(T, K) at most 1."""
 
 
-def write_folder(
+def write_folder(  # noqa: PLR0913 - what a folder holds
     out: Path,
     mapped: Trajectory,
     query: tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 3"]],
@@ -72,6 +72,7 @@ def write_folder(
     *,
     truth: Float[np.ndarray, "t 3"] | None,
     notes: Sequence[str],
+    own_gap_m: float | None = None,
 ) -> None:
     """Write a data folder; it appears whole or not at all.
 
@@ -83,6 +84,7 @@ def write_folder(
         views: descriptors or retrieval lists.
         truth: poses of the query frames in the frame of the map; None where nobody knows them.
         notes: go to about.toml, from there into the manifest and the report.
+        own_gap_m: the drive is its own map, see `taojax.drive`; None = the map is another drive.
 
     Raises:
         InputError: `out` exists, cannot be written, or a value is not finite.
@@ -93,11 +95,13 @@ def write_folder(
         with locked_part(out, is_folder=True) as part:
             for name in ("map", "query", *(("truth",) if truth is not None else ())):
                 (part / name).mkdir()
-            origin, moved = _origin(mapped.xyt, truth)
+            # The truth of a drive that is its own map lies in a frame of its own.
+            origin, moved = _origin(mapped.xyt, truth if own_gap_m is None else None)
             files = {
                 "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
                 "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
-                "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n",
+                "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n"
+                + ("" if own_gap_m is None else f"own_gap_m = {own_gap_m}\n"),
             }
             if truth is not None:
                 files["truth/query_poses.csv"] = stamped_text(

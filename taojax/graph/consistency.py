@@ -12,17 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from taojax.graph.answers import Closure
+from taojax.graph.answers import DIRECTION_RAD, Closure
 from taojax.graph.odometry import Chain, Walk, spread, walk
 
 __all__ = ["Clique", "consistent", "exact_clique", "greedy_clique"]
 
 GATE = 9.21
 """Largest squared Mahalanobis distance of a consistent pair: 99 % of chi^2, two dimensions."""
-
-DIRECTION_RAD = 0.3
-"""Standard deviation between the direction of travel and that of a map image, or its reverse,
-where the heading was not answered [rad]: a lane change, a bend between two images."""
 
 
 class Clique(NamedTuple):
@@ -33,6 +29,18 @@ class Clique(NamedTuple):
 
     is_largest: bool
     """Proven; False where time ran out or nothing was proven."""
+
+
+def _between_ends(chain: Chain, walked: Walk, closures: Sequence[Closure], i: int) -> np.ndarray:
+    """Return how far odometry may have erred between the older ends of closures (c, 2, 2) [m^2].
+
+    Where the map is the drive itself, it drifts as the drive does.
+    """
+    ends = np.array([c.tie.frame - chain.first for c in closures if c.tie is not None])
+    spacings, by_turn = spread(walked, np.full(len(ends), ends[i]), ends)
+    driven = chain.noise.angle_rad**2 * by_turn[:, :2, :2]
+    driven[:, [0, 1], [0, 1]] += (chain.noise.share * chain.spacing_m) ** 2 * spacings[:, None]
+    return driven
 
 
 def _distances(
@@ -48,6 +56,8 @@ def _distances(
     spacings, by_turn = spread(walked, np.full(len(rows), rows[i]), rows)
     driven = chain.noise.angle_rad**2 * by_turn[:, :2, :2]
     driven[:, [0, 1], [0, 1]] += (chain.noise.share * chain.spacing_m) ** 2 * spacings[:, None]
+    if own.tie is not None:
+        known = known + _between_ends(chain, walked, closures, i)
     best = np.full(len(rows), np.inf)
     for heading in (own.pose[2], own.pose[2] + np.pi) if is_axial else (own.pose[2],):
         # Rotation from the axes of dead reckoning to those of the map.

@@ -10,10 +10,13 @@ from jaxtyping import Float
 from taojax.closures import between, compose
 from taojax.graph.answers import Answers, Closure, Run2D, Stream
 from taojax.graph.consistency import consistent, exact_clique, greedy_clique
-from taojax.graph.odometry import FEW, Chain, Noise, dead_reckoning, estimate, steps_m
+from taojax.graph.odometry import DRIFTING, FEW, Chain, Noise, dead_reckoning, estimate, steps_m
 from taojax.graph.optimise import BackEnd, Solution, solve
 
-__all__ = ["Outcome", "Problem", "build", "optimise", "optimise_all"]
+__all__ = ["ALONE", "Outcome", "Problem", "build", "optimise", "optimise_all", "optimise_few"]
+
+ALONE = "no closure: odometry alone, "
+"""Begins the note of a method without closures."""
 
 CLIQUE_S = 10.0
 """Time for the largest consistent set; after that the largest one found is taken."""
@@ -21,6 +24,12 @@ CLIQUE_S = 10.0
 MOST_PAIRED = 2000
 """Closures that are compared in pairs at most: 4 million pairs take some seconds. Of more, every
 second, third, ... is taken."""
+
+
+MOST_FREE = 200
+"""First candidates of one drive that closes on itself at most: wrong ties between free frames fill
+the equations, and a thousand of them take minutes. Of more, those of every second, third, ... frame
+are taken."""
 
 
 class Problem(NamedTuple):
@@ -36,6 +45,17 @@ class Problem(NamedTuple):
 
     area_m2: float
     """Of the box around the map."""
+
+    first: int = 0
+    """First frame of the test half, whose closures count; the chain may begin earlier."""
+
+    every: int = 1
+    """Of so many frames one hands its first candidate to the back-ends."""
+
+    @property
+    def thinned(self) -> str:
+        """What must be said of that; empty where all do."""
+        return f"of every {self.every}th frame" if self.every > 1 else ""
 
 
 class Outcome(NamedTuple):
@@ -106,17 +126,31 @@ def build(run: Run2D, *, calibration_end: int, first: int, window: int) -> Probl
     final = run.answers.final
     low, high = run.map_pose[:, :2].min(axis=0), run.map_pose[:, :2].max(axis=0)
     area = float(np.prod(np.maximum(high - low, run.spacing_m)))
+    if run.is_own:
+        # Both ends of a closure are free: the graph is the whole drive, fixed at its first frame.
+        path = run.odometry
+        whole = _cut(run, 0, len(path), DRIFTING)
+        anchor = run.map_pose[np.flatnonzero(whole.is_start)]
+        n = int((run.answers.top1.accepted & _among(run.answers.top1, first, len(path))).sum())
+        every = max(1, -(-n // MOST_FREE))
+        return Problem(run.answers, whole, anchor, "from its first frame", area, first, every)
     accepted = final.closures(final.accepted & _among(final, 0, calibration_end))
     calibration = _cut(run, 0, calibration_end, FEW)
     noise = estimate(calibration, accepted, window, area)
     chain = _cut(run, first, len(run.odometry), noise)
     anchor, said = _anchors(run, chain)
-    return Problem(run.answers, chain, anchor, said, area)
+    return Problem(run.answers, chain, anchor, said, area, first)
 
 
 def _of(problem: Problem, stream: Stream, chosen: np.ndarray) -> tuple[Closure, ...]:
-    first = problem.chain.first
-    return stream.closures(chosen & _among(stream, first, first + len(problem.chain.odometry)))
+    return stream.closures(chosen & _among(stream, problem.first, len(stream.accepted)))
+
+
+def _raw(problem: Problem, gate: float = -np.inf) -> tuple[Closure, ...]:
+    """Return the first candidates whose similarity a gate lets through."""
+    top1, similarity = problem.answers.top1, problem.answers.similarity
+    is_turn = np.arange(len(similarity)) % problem.every == 0
+    return _of(problem, top1, top1.accepted & is_turn & (similarity >= gate))
 
 
 def optimise(
@@ -142,7 +176,7 @@ def optimise(
     solution = solve(problem.chain, closures, back_end, problem.anchor, problem.area_m2)
     took = before_s + time.perf_counter() - start
     if not closures:
-        note = f"no closure: odometry alone, {problem.anchored}"
+        note = f"{ALONE}{problem.anchored}"
     return Outcome(method, tuple(closures), solution, took, note)
 
 
@@ -151,7 +185,7 @@ def _paired(problem: Problem, closures: tuple[Closure, ...]) -> list[Outcome]:
     start = time.perf_counter()
     every = -(-len(closures) // MOST_PAIRED) or 1
     thinned = closures[::every]
-    note = f"of every {every}th answer" if every > 1 else ""
+    note = f"of every {every}th answer" if every > 1 else problem.thinned
     agree = consistent(problem.chain, thinned)
     pairs_s = time.perf_counter() - start
     found = []
@@ -169,6 +203,16 @@ def _paired(problem: Problem, closures: tuple[Closure, ...]) -> list[Outcome]:
     return found
 
 
+def optimise_few(problem: Problem) -> list[Outcome]:
+    """Run the two methods that one sentence compares: all first candidates, and ours."""
+    final = problem.answers.final
+    ours = _of(problem, final, final.accepted)
+    return [
+        optimise(problem, "top1_gnc", _raw(problem), "gnc", note=problem.thinned),
+        optimise(problem, "ours", ours, "plain"),
+    ]
+
+
 def optimise_all(
     problem: Problem, gate: float, say: Callable[[str], None] = lambda text: None
 ) -> list[Outcome]:
@@ -180,9 +224,9 @@ def optimise_all(
         say: told the name of each method before it starts.
     """
     answers = problem.answers
-    final, now, top1 = answers.final, answers.now, answers.top1
-    raw = _of(problem, top1, top1.accepted)
-    gated = _of(problem, top1, top1.accepted & (answers.similarity >= gate))
+    final, now = answers.final, answers.now
+    raw, gated, thinned = _raw(problem), _raw(problem, gate), problem.thinned
+    is_turn = np.arange(len(final.accepted)) % problem.every == 0
     ours = _of(problem, final, final.accepted)
     plans: list[tuple[str, tuple[Closure, ...], BackEnd]] = [
         ("top1_huber", raw, "huber"),
@@ -192,13 +236,15 @@ def optimise_all(
         ("ours", ours, "plain"),
         ("ours_gnc", ours, "gnc"),
         ("ours_now", _of(problem, now, now.accepted), "plain"),
-        ("ours_switch", _of(problem, final, np.ones(len(final.accepted), bool)), "switch"),
+        ("ours_switch", _of(problem, final, is_turn), "switch"),
     ]
     out = []
+    all_frames = ("ours", "ours_gnc", "ours_now")
     for name, closures, back_end in plans:
         if name == "ours":
             say("pcm")
             out += _paired(problem, raw)
         say(name)
-        out.append(optimise(problem, name, closures, back_end))
+        note = "" if name in all_frames else thinned
+        out.append(optimise(problem, name, closures, back_end, note=note))
     return out

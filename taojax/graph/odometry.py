@@ -10,6 +10,7 @@ from taojax.closures import ODOMETRY_RAD, ODOMETRY_SHARE, compose, wrap
 from taojax.graph.answers import Closure
 
 __all__ = [
+    "DRIFTING",
     "FEW",
     "Chain",
     "Noise",
@@ -70,6 +71,9 @@ class Noise(NamedTuple):
 
 
 FEW = Noise(ODOMETRY_SHARE, ODOMETRY_RAD, "the default, for the calibration half has few closures")
+DRIFTING = FEW._replace(
+    why="the default, for the map of a drive that closes on itself drifts as its odometry does"
+)
 CONTRARY = FEW._replace(
     why="the default, for closures and odometry of the calibration half do not agree"
 )

@@ -10,14 +10,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from taojax.closures import compose, in_axes_of, wrap
+from taojax.closures import between, compose, in_axes_of, wrap
 from taojax.errors import MissingExtraError
 from taojax.graph.answers import Closure
 from taojax.graph.odometry import Chain, dead_reckoning
 
-__all__ = ["BackEnd", "Solution", "check_extra", "solve"]
+__all__ = ["INSTALL", "BackEnd", "Solution", "check_extra", "has_extra", "solve"]
 
 BackEnd = Literal["plain", "huber", "geman_mcclure", "gnc", "switch"]
+
+INSTALL = "python -m pip install 'taojax[graph]'"
+"""Brings GTSAM."""
 
 HUBER = 1.345
 """Residual in standard deviations at which Huber's kernel turns linear: 95 % efficiency on Gaussian
@@ -31,6 +34,10 @@ INLIERS = 0.99
 
 LM_STEPS = 100
 """Most steps of Levenberg-Marquardt."""
+
+FREE_STEPS = 10
+"""The same within a round of GNC where both ends of closures are free: a step takes ten times as
+long there, and the next round goes on from where one ends."""
 
 SWITCH_STEPS = 30
 """Most rounds of the switches; they settle in about ten."""
@@ -59,14 +66,19 @@ class Solution(NamedTuple):
     """What GNC or the switches left of each closure, 0 to 1; 1 for the other back-ends."""
 
 
+def has_extra() -> bool:
+    """Return whether GTSAM is there."""
+    return importlib.util.find_spec("gtsam") is not None
+
+
 def check_extra() -> None:
     """Check, before any work, that GTSAM is there.
 
     Raises:
         MissingExtraError: it is not.
     """
-    if importlib.util.find_spec("gtsam") is None:
-        raise MissingExtraError("graph needs gtsam; run: python -m pip install 'taojax[graph]'")
+    if not has_extra():
+        raise MissingExtraError(f"graph needs gtsam; run: {INSTALL}")
 
 
 def _aligned(path: np.ndarray, rows: np.ndarray, closures: Sequence[Closure]) -> np.ndarray:
@@ -114,6 +126,8 @@ def _starts(
     them, where all have a heading. Stretches without closures start at their anchor.
     """
     path = dead_reckoning(chain.odometry, chain.is_start)
+    if any(c.tie is not None for c in closures):
+        return (compose(anchor[0], path),)
     row_of = np.array([c.frame - chain.first for c in closures], int)
     laid, joined, has_heading = path.copy(), path.copy(), True
     for (first, end), pose in zip(chain.parts(), anchor, strict=True):
@@ -136,7 +150,8 @@ def _odometry_graph(chain: Chain, closures: Sequence[Closure], start: np.ndarray
 
     graph, diagonal = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Diagonal.Sigmas
     sigma = np.sqrt(chain.variances())
-    rows = {c.frame - chain.first for c in closures}
+    # A closure onto the fixed map holds its stretch; one between two free frames does not.
+    rows = {c.frame - chain.first for c in closures if c.tie is None}
     for first, end in chain.parts():
         length = float(chain.way_m[first:end].sum())
         is_open = rows.isdisjoint(range(first, end))
@@ -166,6 +181,9 @@ def _factor(closure: Closure, first: int, weight: float = 1.0, kernel: Any = Non
     noise: Any = gtsam.noiseModel.Gaussian.Covariance(known)
     if kernel is not None:
         noise = gtsam.noiseModel.Robust.Create(kernel, noise)
+    if closure.tie is not None:
+        other = closure.tie.frame - first
+        return gtsam.BetweenFactorPose2(other, row, gtsam.Pose2(*closure.tie.motion), noise)
     if has_heading:
         return gtsam.PriorFactorPose2(row, gtsam.Pose2(*closure.pose), noise)
     # The error of a prior on the whole pose would mix an unknown heading into the position.
@@ -187,6 +205,26 @@ def _poses(values: Any) -> np.ndarray:
     return np.asarray(gtsam.utilities.extractPose2(values))
 
 
+def _lago(chain: Chain, closures: Sequence[Closure], start: np.ndarray) -> np.ndarray:
+    """Return a first guess whose headings solve the linear part of the problem, (n, 3).
+
+    Odometry that has turned too far leads into a wrong minimum; this does not start from it.
+    Carlone, Aragues, Castellanos & Bona, A fast and accurate approximation for planar pose graph
+    optimization, IJRR 2014. It takes diagonal covariances alone.
+    """
+    import gtsam
+
+    graph = _odometry_graph(chain, closures, start)
+    for closure in closures:
+        if closure.tie is None:
+            continue
+        sigma = np.sqrt(np.diag(in_axes_of(closure.pose, closure.covariance)))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+        ends = closure.tie.frame - chain.first, closure.frame - chain.first
+        graph.add(gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*closure.tie.motion), noise))
+    return _poses(gtsam.lago.initialize(graph))
+
+
 def _minimise(graph: Any, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the poses that Levenberg-Marquardt ends at, (n, 3), and their cost."""
     import gtsam
@@ -198,15 +236,20 @@ def _minimise(graph: Any, start: np.ndarray) -> tuple[np.ndarray, float]:
     return _poses(values), float(graph.error(values))
 
 
-def _gnc(graph: Any, start: np.ndarray, n_closures: int) -> Solution:
+def _gnc(graph: Any, start: np.ndarray, n_closures: int, *, is_free: bool) -> Solution:
     """Solve by graduated non-convexity with truncated least squares; odometry is never doubted.
 
     Yang, Antonante, Tzoumas & Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L
-    2020. The closures are the last factors of the graph.
+    2020. The closures are the last factors of the graph; with both ends free a round of it takes
+    few steps.
     """
     import gtsam
 
     params = gtsam.GncLMParams()
+    if is_free:
+        steps = gtsam.LevenbergMarquardtParams()
+        steps.setMaxIterations(FREE_STEPS)
+        params = gtsam.GncLMParams(steps)
     trusted = graph.size() - n_closures
     params.setKnownInliers(list(range(trusted)))
     optimizer = gtsam.GncLMOptimizer(graph, _values(start), params)
@@ -219,8 +262,15 @@ def _residuals(pose: np.ndarray, chain: Chain, closures: Sequence[Closure]) -> n
     """Return the log densities of all closures at the poses [1 / (m^2 rad)], (c,)."""
     rows = [c.frame - chain.first for c in closures]
     gap = np.array([c.pose for c in closures]) - pose[rows]
-    gap[:, 2] = wrap(gap[:, 2])
     spread = np.array([c.covariance for c in closures])
+    if closures[0].tie is not None:
+        # In axes of the answer, which move with the older end.
+        leads = np.array(
+            [compose(pose[c.tie.frame - chain.first], c.tie.motion) for c in closures if c.tie]
+        )
+        gap = between(leads, pose[rows])
+        spread = in_axes_of(np.array([c.pose for c in closures]), spread)
+    gap[:, 2] = wrap(gap[:, 2])
     log_p = np.empty(len(closures))
     has_heading = np.isfinite(spread[:, 2, 2])
     for chosen, n in ((has_heading, 3), (~has_heading, 2)):
@@ -295,10 +345,12 @@ def solve(
         return graph
 
     plain = with_closures()
+    is_free = closures[0].tie is not None
+    starts = (*starts, *((_lago(chain, closures, starts[0]),) if is_free else ()))
     pose, _ = min((_minimise(plain, start) for start in starts), key=lambda found: found[1])
     estimator = gtsam.noiseModel.mEstimator
     if back_end == "gnc":
-        return _gnc(plain, pose, len(closures))
+        return _gnc(plain, pose, len(closures), is_free=is_free)
     if back_end == "switch":
 
         def odometry() -> Any:

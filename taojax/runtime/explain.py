@@ -112,9 +112,12 @@ def sealed_tables(folder: Path, run: Run, config: StreamConfig) -> MapTables:
         config: its settings.
 
     Raises:
-        InputError: the run was sealed before runs could be explained.
+        InputError: the run was sealed before runs could be explained, or its map grew.
     """
     facts = run.manifest
+    if "own_gap_m" in facts:
+        what = "is one drive that closes on itself, whose frames no single map explains"
+        raise InputError(f"{folder}: {what}; look at its report.html and at `taojax graph`")
     lacks = [name for name in ("map_scale", "map_recall", "trial_frames") if name not in facts]
     lacks += [] if "odometry.csv" in facts["sha256"] else ["odometry.csv"]
     if lacks:

@@ -106,7 +106,7 @@ def init(config: VerdictConfig, tables: MapTables) -> State:
     """Return the state before the first frame."""
     p = reach_frames(config)
     return State(
-        belief=uninformed(config, tables.places.grid.xy.shape[0]),
+        belief=uninformed(config, tables.places.grid.xy.shape[0], tables.places.n_known),
         pending=jnp.zeros(3),
         past=Seen(jnp.zeros((p, 3)), jnp.full((p, LISTED), -1), jnp.zeros((p, LISTED))),
         answers=jnp.zeros((p, 3)),
@@ -298,7 +298,7 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
 
     # One loop for both parts: what is kept of the frames after the block is not used.
     every = ahead[0], motion, is_due, weight
-    nothing = uninformed(config, places.grid.xy.shape[0])
+    nothing = uninformed(config, places.grid.xy.shape[0], places.n_known)
     start, kept = nothing, jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape)), nothing)
 
     def back_kept(at: Array, carry: tuple[Belief, Belief]) -> tuple[Belief, Belief]:
@@ -334,7 +334,7 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
     index, scaled = block.seen.index[:, :LISTED], block.seen.scaled[:, :LISTED]
 
     def answered(at: Array, forward: Belief, backward: Belief, since: Array) -> Answer:
-        belief = combined(config, forward, backward)
+        belief = combined(config, forward, backward, places.n_known)
         reading = read(config, places, belief, since)
         here = n_past + at
         local = between(jnp.broadcast_to(poses[here], poses.shape), poses)[:, :2]

@@ -183,6 +183,7 @@ def map_tables(
             grid=_grid(poses, step_m, PLACES_REACH * step_m),
             gap_m=jnp.asarray(step_m, jnp.float32),
             unit_m=jnp.asarray(unit * step_m, jnp.float32),
+            n_known=jnp.asarray(len(poses), jnp.float32),
         ),
         spacing_m=jnp.asarray(spacing_m, jnp.float32),
         extent_m=jnp.asarray(np.sqrt(np.mean(np.sum(centred**2, axis=1))), jnp.float32),

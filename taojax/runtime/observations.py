@@ -54,6 +54,9 @@ class Observations:
     trial_frames: int | None = None
     """The log is a row of trials of so many frames, each with a fresh start; None = one log."""
 
+    own_gap_m: float | None = None
+    """The drive is its own map, see `taojax.drive`; None = the map is another drive."""
+
     @property
     def map_xyt(self) -> np.ndarray:
         """(M, 3) map poses: x [m], y [m], theta [rad]."""
@@ -159,11 +162,12 @@ def _refuse_truth(folder: Path, names: Sequence[str]) -> None:
             )
 
 
-def load_observations(folder: Path) -> Observations:
+def load_observations(folder: Path, *, may_be_own: bool = False) -> Observations:
     """Load and check a data folder; the only reader of sensor files. Never looks into truth/.
 
     Args:
         folder: laid out as data_specs/README.md says.
+        may_be_own: whether the caller can replay a drive that is its own map.
 
     Raises:
         InputError: naming file, row and fix.
@@ -185,7 +189,17 @@ def load_observations(folder: Path) -> Observations:
         names = descriptor_names(folder)
         descriptors = _load_descriptors(folder, names, n_map, n_query)
         files += names
-    notes, trial_frames = read_about(folder, n_query)
+    notes, trial_frames, own_gap_m = read_about(folder, n_query)
+    if own_gap_m is not None and not may_be_own:
+        raise InputError(
+            f"{folder}: is one drive that closes on itself (own_gap_m in about.toml), which only"
+            " audit, score, evaluate, closures and graph know"
+        )
+    if own_gap_m is not None and n_map != n_query:
+        raise InputError(
+            f"{folder / files[0]}: {n_map} rows for {n_query} frames; a drive that is its own map"
+            " has a pose for every frame, make it with `taojax convert self`"
+        )
     files += ["about.toml"] if (folder / "about.toml").exists() else []
     motion = stacked(odometry, MOTION)
     return Observations(
@@ -197,4 +211,5 @@ def load_observations(folder: Path) -> Observations:
         notes=notes,
         sha256={INPUTS + name: digest_file(folder / name) for name in files},
         trial_frames=trial_frames,
+        own_gap_m=own_gap_m,
     )

@@ -43,10 +43,12 @@ class RecursiveState(eqx.Module):
     off: Float[Array, ""]
 
 
-def init_recursive(n_anchors: int) -> RecursiveState:
-    """Return the belief before the first frame: anywhere."""
+def init_recursive(tables: MapTables) -> RecursiveState:
+    """Return the belief before the first frame: anywhere on the map."""
     # Explicit types: a weakly typed start would compile the second step again.
-    mass = jnp.full((2, n_anchors), (1.0 - START_OFF) / (2 * n_anchors), jnp.float32)
+    n_anchors, n = tables.grid.xy.shape[0], tables.places.n_known
+    is_known = (jnp.arange(n_anchors, dtype=jnp.float32) < n).astype(jnp.float32)
+    mass = jnp.broadcast_to(is_known * ((1.0 - START_OFF) / (2 * n)), (2, n_anchors))
     return RecursiveState(mass, jnp.full((), START_OFF, jnp.float32))
 
 
@@ -111,7 +113,9 @@ def recursive_step(
     arriving = jnp.where(is_linked, (1.0 - LEAK) * arriving, 0.0)
     gone = jnp.maximum(1.0 - state.off - jnp.sum(arriving), 0.0)
     off = STAY_OFF * state.off + gone
-    mass = arriving + (1.0 - STAY_OFF) * state.off / (2 * m)
+    n = tables.places.n_known
+    anywhere = (1.0 - STAY_OFF) * state.off / (2 * n)
+    mass = arriving + jnp.where(jnp.arange(m, dtype=jnp.float32) < n, anywhere, 0.0)[None]
 
     # An anchor that the list lacks looks like background, whose evidence is 1.
     listed = jnp.where(index >= 0, index, m)

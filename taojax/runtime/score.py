@@ -1,6 +1,7 @@
 """A whole data set through the stream into one sealed table, with progress."""
 
 import platform
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ from taojax import __version__
 from taojax.config import Config, replace, to_toml
 from taojax.detector import foreign_map
 from taojax.errors import InputError
-from taojax.records import code_digest, map_of, refuse_if_taken, write_run
+from taojax.records import SealedTrack, code_digest, map_of, refuse_if_taken, write_run
 from taojax.risk import SHIPPED, Calibration, for_run, shipped
 from taojax.risk import to_toml as calibration_toml
-from taojax.runtime import hindsight
+from taojax.runtime import growing, hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
@@ -156,7 +157,11 @@ def score(
         InputError: the data do not meet their spec, or `out` is taken.
     """
     refuse_if_taken(out)
-    observations = load_observations(dataset)
+    observations = load_observations(dataset, may_be_own=True)
+    if observations.own_gap_m is not None:
+        if rival_logs is not None:
+            raise InputError(f"{dataset}: is its own map, on which no rival runs; drop --rivals")
+        return _score_own(dataset, out, config, observations, calibration, progress=progress)
     index, similarity = candidates(observations)
     known = observations.descriptors and observations.descriptors[0]
     tables = map_tables(observations.map_xyt, config.stream, known)
@@ -176,17 +181,66 @@ def score(
         literal = replayed(replace(config, {"association": "rank"}))
         said = rival_tracks(observations, frames, most_logs=rival_logs, progress=progress)
         tracks = {"tao_rank": sealed_track(literal, "tao_rank"), **said}
-    # What repeats this run, seen from its own folder; the words typed may name files long gone.
-    command = f"taojax score {dataset} --config config.toml"
     table = signal_table(observations.t_s, records) | hindsight.now_columns(both.now)
     delayed = hindsight.delayed_columns(tables, both)
-    notes = list(observations.notes)
-    if config.stream.refine:
-        notes.append(check_refinement(config, records, replayed))
-    known_map = {**map_facts(tables), "sha256": observations.sha256}
+    notes = [check_refinement(config, records, replayed)] if config.stream.refine else []
+    said = _Said(table, delayed, index, similarity, tables, notes, tracks)
+    return _sealed(dataset, out, config, observations, calibration, said)
+
+
+def _score_own(
+    dataset: Path,
+    out: Path,
+    config: Config,
+    observations: Observations,
+    calibration: Calibration | None,
+    *,
+    progress: bool,
+) -> dict[str, Any]:
+    """Score a drive that is its own map."""
+    cut = growing.blocks(observations.odometry, float(observations.own_gap_m or 0.0))
+    lists = growing.candidates(observations, cut, progress=progress)
+    grown = growing.replay_growing(config, observations, cut, lists, progress=progress)
+    table = signal_table(observations.t_s, grown.record) | grown.now
+    note = (
+        f"one drive that closes on itself: a frame knows what lies {observations.own_gap_m:g} m of"
+        f" way or more behind it, in blocks of {growing.BLOCK} frames; places lie where the drive's"
+        " own odometry has put them"
+    )
+    said = _Said(table, grown.delayed, *lists, grown.tables, [note], None)
+    return _sealed(dataset, out, config, observations, calibration, said)
+
+
+@dataclass(frozen=True)
+class _Said:
+    """What a run says, to be sealed."""
+
+    signals: dict[str, np.ndarray]
+    delayed: dict[str, np.ndarray]
+    index: np.ndarray
+    similarity: np.ndarray
+    tables: MapTables
+    notes: list[str]
+    tracks: dict[str, SealedTrack] | None
+
+
+def _sealed(
+    dataset: Path,
+    out: Path,
+    config: Config,
+    observations: Observations,
+    calibration: Calibration | None,
+    said: _Said,
+) -> dict[str, Any]:
+    """Decide and seal; return the manifest."""
+    table, delayed = said.signals, said.delayed
+    # What repeats this run, seen from its own folder; the words typed may name files long gone.
+    command = f"taojax score {dataset} --config config.toml"
+    notes = [*observations.notes, *said.notes]
+    known_map = {**map_facts(said.tables), "sha256": observations.sha256}
     used = for_run(calibration or shipped(), config.audit.max_wrong, config.verdict.lag)
-    if said := foreign_map(used.fitted_on, map_of(known_map)):
-        notes.append(said)
+    if foreign := foreign_map(used.fitted_on, map_of(known_map)):
+        notes.append(foreign)
     if used.fitted_on is None:
         notes.append(f"decided with {SHIPPED}: no frame of this place has set its level")
     return write_run(
@@ -196,15 +250,16 @@ def score(
         odometry=read_bytes(dataset / "query/odometry.csv"),
         decisions=decide(used, table, delayed),
         calibration_toml=calibration_toml(used),
-        tracks=tracks,
+        tracks=said.tracks,
         map_poses=observations.map_poses,
-        index=index,
-        similarity=similarity,
+        index=said.index,
+        similarity=said.similarity,
         config_toml=to_toml(config),
         manifest={
             **facts_of(command, dataset, config.seed),
             "notes": notes,
             **known_map,
-            "trial_frames": n,
+            "trial_frames": observations.trial_frames,
+            **({} if observations.own_gap_m is None else {"own_gap_m": observations.own_gap_m}),
         },
     )

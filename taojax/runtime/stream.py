@@ -127,7 +127,7 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
 def init_memory(config: StreamConfig, tables: MapTables) -> Memory:
     """Return what joint association remembers before the first frame."""
     m = tables.grid.xy.shape[0]
-    return Memory(init_joint(config, m), init_recursive(m))
+    return Memory(init_joint(config, m), init_recursive(tables))
 
 
 def memory_step(

@@ -21,7 +21,7 @@ from taojax.verbs.common import (
     score_apart,
     told,
 )
-from taojax.verbs.layout import check_layout
+from taojax.verbs.layout import check_drive, check_layout
 from taojax.verbs.resume import claimed, is_sealed
 
 if TYPE_CHECKING:
@@ -51,6 +51,13 @@ class Audit(Common):
     map: Annotated[Path | None, flag("FOLDER", "DATASET holds it")] = None
     """With --simulate-views: folder of the map drive, where DATASET is the query drive alone."""
 
+    self: Annotated[bool, flag("", "False")] = False
+    """DATASET is one drive that closes on itself: a frame's map is what lies --gap-m behind it.
+    With a map/, the query's drive follows the map's. As `taojax convert self`, then audit."""
+
+    gap_m: Annotated[float | None, flag("M", "50")] = None
+    """With --self: way between a frame and the newest one that it may close on, metres."""
+
 
 def run(args: Audit) -> None:
     """Audit a data folder or the simulated world."""
@@ -60,16 +67,23 @@ def run(args: Audit) -> None:
         raise UsageError("--simulate-views completes a DATASET; name one")
     if args.map is not None and not args.simulate_views:
         raise UsageError("--map goes with --simulate-views")
-    if args.dataset is not None and not args.simulate_views:
+    if args.self and (args.dataset is None or args.simulate_views):
+        raise UsageError("--self audits one DATASET as it is; name it and drop --simulate-views")
+    if args.gap_m is not None and not args.self:
+        raise UsageError("--gap-m goes with --self")
+    is_ready = args.dataset is not None and not args.simulate_views and not args.self
+    if args.dataset is not None and is_ready:
         check_layout(args.dataset, has_truth=True)
+    if args.dataset is not None and args.self:
+        check_drive(args.dataset)
     config = config_of(args)
     out = out_of(args, "audit", config)
-    if args.dataset is not None and not args.simulate_views:
+    if args.dataset is not None and is_ready:
         _audit_folder(args.dataset, out, config, progress=args.progress)
         return
     with claimed(out, told(args, config)):
         if args.dataset is not None:
-            _audit_converted(args.dataset, args.map, out, config, progress=args.progress)
+            _audit_converted(args, out, config)
         else:
             _audit_world(args.scenario, out, config, progress=args.progress)
 
@@ -84,16 +98,23 @@ def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool)
     _judge(dataset, out, config)
 
 
-def _audit_converted(
-    dataset: Path, mapped: Path | None, out: Path, config: "Config", *, progress: bool
-) -> None:
-    """Complete a plain folder by simulation in out/data, then audit that."""
-    from taojax.verbs.convert import make
-    from taojax.verbs.convert_flags import Folder
+def _convert(args: Audit, data: Path, seed: int) -> None:
+    """Make the data folder that is audited in place of DATASET."""
+    from taojax.verbs.convert import make, make_self
+    from taojax.verbs.convert_flags import Folder, Self
 
-    data, scored = out / "data", out / "scored"
+    assert args.dataset is not None  # noqa: S101 - the caller has asked
+    if args.self:
+        make_self(Self(folder=args.dataset, out=data, gap_m=args.gap_m, seed=seed))
+        return
+    make(Folder(folder=args.dataset, out=data, map=args.map, simulate_views=True, seed=seed))
+
+
+def _audit_converted(args: Audit, out: Path, config: "Config") -> None:
+    """Make of DATASET what can be audited, in out/data, then audit that."""
+    data, scored, progress = out / "data", out / "scored", args.progress
     if not data.exists():
-        make(Folder(folder=dataset, out=data, map=mapped, simulate_views=True, seed=config.seed))
+        _convert(args, data, config.seed)
     if not is_sealed(out, data, config):
         if not is_sealed(scored, data, config):
             shutil.rmtree(scored, ignore_errors=True)
@@ -112,6 +133,9 @@ def _judge(dataset: Path, out: Path, config: "Config") -> None:
     evaluation = evaluate(out, dataset / "truth", config)
     print("\n".join(evaluation.sentences))
     say(f"report: {out}/report.html")
+    if "own_gap_m" in evaluation.judgement.manifest:
+        say(f"next:   taojax closures {out}; taojax graph {out}")
+        return
     wrong = (evaluation.judgement.outcome == "accepted_wrong").nonzero()[0]
     frame = wrong[-1] if wrong.size else len(evaluation.judgement.outcome) - 1
     say(f"next:   taojax explain {out} --frame {frame}; taojax closures {out}")

@@ -52,8 +52,10 @@ def run(args: Closures) -> None:
     n_map, n_query = len(graph.map_pose), len(graph.query_pose)
     n = {verdict: len(graph.rows(verdict)) for verdict in ("accept", "reject", "abstain")}
     n_frames, n_posed = len(graph.verdict), sum(n.values())
-    print(f"verdicts of {verdicts.source} on {n_frames} frames; vertices 0 to {n_map - 1} are the "
-          f"map, {n_map} to {n_map + n_query - 1} the query frames")  # fmt: skip
+    vertices = f"vertices 0 to {n_map - 1} are the map, {n_map} to {n_map + n_query - 1} the query"
+    if graph.is_own:
+        vertices = f"vertices 0 to {n_query - 1} are the drive's"
+    print(f"verdicts of {verdicts.source} on {n_frames} frames; {vertices} frames")
     print(f"closures.g2o    {n['accept']} accepted closures")
     print(f"rejected.g2o    {n['reject']} rejected ones, to look at")
     print(f"left out        {n['abstain']} on which nothing was decided, "

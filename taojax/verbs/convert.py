@@ -18,6 +18,7 @@ from taojax.verbs.convert_flags import (
     Mulran,
     Pair,
     Robotcar,
+    Self,
     Sthereo,
     Vivid,
 )
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     Sessions = tuple[Session, Session | None]
 
-__all__ = ["Convert", "make", "run"]
+__all__ = ["Convert", "make", "make_self", "run"]
 
 Data = Pair | Folder | Files
 
@@ -38,8 +39,25 @@ Data = Pair | Folder | Files
 def run(args: Convert) -> None:
     """Make the data folder and say what comes next."""
     out = args.data.out
+    if isinstance(args.data, Self):
+        make_self(args.data)
+        say(f"wrote {out}; next: taojax audit {quote(str(out))}")
+        return
     make(args.data)
     say(f"wrote {out}; next: taojax inspect {quote(str(out))}")
+
+
+def make_self(data: Self) -> None:
+    """Make the data folder of one drive and say what was found."""
+    from taojax.datasets.own_map import GAP_M, write_own_map
+    from taojax.verbs.layout import check_folder
+
+    gap_m = GAP_M if data.gap_m is None else data.gap_m
+    if not gap_m > 0:
+        raise UsageError(f"--gap-m {data.gap_m} must be positive")
+    check_folder(data.folder)
+    for note in write_own_map(data.folder, data.out, gap_m, seed=data.seed):
+        say(f"note: {note}")
 
 
 def make(data: Data) -> None:

@@ -200,6 +200,27 @@ class Files(Making):
 
 
 @dataclasses.dataclass(frozen=True)
+class Self:
+    """One drive that closes on itself: a frame's map is what lies so much way behind it.
+
+    Example: taojax convert self my_drive OUT --gap-m 50
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional, _place("FOLDER")]
+    """Data folder of one drive: query/ and, to audit, truth/. With map/ too, the query's drive
+    follows the map's."""
+
+    out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
+    """Data folder to make."""
+
+    gap_m: Annotated[float | None, flag("M", "50")] = None
+    """Way between a frame and the newest that it may close on, metres; in buildings 10 to 20."""
+
+    seed: int = 0
+    """Of odometry that is simulated where two drives are joined."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Convert:
     """Make a data folder of a public data set or of your own recordings.
 
@@ -207,7 +228,7 @@ class Convert:
     """
 
     data: Annotated[
-        Sthereo | Kri | Mulran | ComplexUrban | Robotcar | Vivid | Folder | Files,
+        Sthereo | Kri | Mulran | ComplexUrban | Robotcar | Vivid | Folder | Files | Self,
         tyro.conf.OmitSubcommandPrefixes,
         tyro.conf.OmitArgPrefixes,
     ]

@@ -5,7 +5,7 @@ from shlex import quote
 
 from taojax.errors import InputError
 
-__all__ = ["advice", "check_folder", "check_layout", "missing"]
+__all__ = ["advice", "check_drive", "check_folder", "check_layout", "missing"]
 
 TRUTH = "truth/query_poses.csv"
 LISTS = "query/retrievals.npz"
@@ -32,6 +32,22 @@ def check_layout(folder: Path, *, has_truth: bool) -> None:
     if lacks:
         fix = "add it, or run `taojax score` without truth"
         raise InputError(f"{folder / TRUTH}: no such file; {fix}")
+
+
+def check_drive(folder: Path) -> None:
+    """Refuse what cannot be one drive with its truth.
+
+    Args:
+        folder: to be audited as one drive that closes on itself.
+
+    Raises:
+        InputError: no such folder, or files are missing.
+    """
+    check_folder(folder)
+    for name in ("query/odometry.csv", TRUTH):
+        if not (folder / name).exists():
+            fix = "a drive that closes on itself is audited with its odometry and its true poses"
+            raise InputError(f"{folder / name}: no such file; {fix}")
 
 
 def check_folder(folder: Path) -> None:
