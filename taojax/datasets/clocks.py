@@ -33,7 +33,7 @@ LONG_STEP = 10.0
 """Steps shorter than this many units may well be seconds, or rows."""
 
 LATE_ROWS, LATE_S = 10, 1.0
-"""Messages come late by so many rows or seconds; what is later is another recording."""
+"""Messages come late by so many steps or seconds; what is later is another recording."""
 
 SAME_M, SAME_RAD = 0.05, 0.02
 """Poses of one stamp that are nearer than this are one pose."""
@@ -55,6 +55,7 @@ def seconds(
     step_m: Float[np.ndarray, " m"],
     said: str | None,
     flag: TimeUnit | None,
+    where: Where,
 ) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
     """Turn stamps of any unit into seconds.
 
@@ -64,6 +65,7 @@ def seconds(
         step_m: (n - 1,) metres driven between them.
         said: the unit that the file's format or header names.
         flag: the unit that the user names.
+        where: names a row.
 
     Returns:
         (n,) seconds, and what was assumed.
@@ -73,7 +75,8 @@ def seconds(
     """
     rising = np.diff(t).astype(float)
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
-    top, speed = float(np.abs(t).max()), _speed(t, step_m)
+    top, speed = float(np.abs(np.median(t))), _speed(t, step_m)
+    _check_alike(path, t, where)
     could = [u for u, per in PER_S.items() if step / per >= FASTEST_S and top / per < 1e11]
     if step == 0.0:
         could = [u for u, per in PER_S.items() if top / per < 1e11]
@@ -107,8 +110,20 @@ def seconds(
     if "s" in could and not fits:
         return t / 1.0, ()
     units = " or ".join(WORDS[u] for u in (could or PER_S))
-    what = f"row 1: stamp {t[0]:.16g} with steps of {step:g} may be {units}"
+    what = f"{where(0)}: stamp {t[0]:.16g} with steps of {step:g} may be {units}"
     raise fail(path, what, "add --time-unit s, ms, us or ns")
+
+
+def _check_alike(path: Path, t: np.ndarray, where: Where) -> None:
+    """Refuse a stamp in another unit than the others, or in none."""
+    middle = float(np.abs(np.median(t)))
+    if middle < DATES[0] or not np.ptp(t):
+        return
+    size = np.abs(t).astype(float) / middle
+    if (odd := np.flatnonzero(size > 100.0)).size:
+        at = int(odd[0])
+        what = f"{where(at)}: stamp {t[at]:.16g} is not of the unit of the others, near {middle:.16g}"
+        raise fail(path, what, "bring all stamps to one unit")
 
 
 class Ordered(NamedTuple):
@@ -170,11 +185,10 @@ def _check_late(
 ) -> None:  # fmt: skip
     """Refuse what is no late message: a clock that was set back, or rows in any order."""
     ahead = np.maximum.accumulate(t_s)
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    away = np.arange(len(order)) - place
-    is_far = (away > LATE_ROWS) & (ahead - t_s > LATE_S)
-    at = int(np.argmax(is_far)) if is_far.any() else int(np.flatnonzero(t_s < ahead)[0])
+    step = np.diff(t_s[order])
+    usual = float(np.median(step[step > 0])) if step.any() else 0.0
+    is_far = ahead - t_s > max(LATE_S, LATE_ROWS * usual)
+    at = int(np.flatnonzero(t_s < ahead)[0])
     longer = driven_m(xyt[order])[-1] > 1.001 * driven_m(xyt)[-1] + SAME_M
     if is_far.any() or (longer and not is_motion):
         what = f"{where(at)}: time runs backwards by {ahead[at] - t_s[at]:.6g} s"

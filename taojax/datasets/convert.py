@@ -262,7 +262,7 @@ def _odometry(
     source, paired = on_the_clock_of(
         session, drive, motion.path, gate_s=choices.gate_s, offset_s=motion.offset_s
     )
-    steps, said = odometry_at(source, query.t_s, choices.gate_s)
+    steps, said = odometry_at(source, query.t_s, choices.gate_s, str(motion.path))
     named = f"odometry from {motion.path.name} ({motion.kind})"
     return steps, (named, *paired, *(() if said is None else (said,)))
 

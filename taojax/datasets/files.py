@@ -59,17 +59,19 @@ def kind_of(path: Path, reading: Reading = PLAIN) -> OdometryKind | None:
         return "robotcar-vo"
     if text[0].startswith(("VERTEX_", "EDGE_", "FIX ")):
         return "g2o"
+    table = read_rows(path, reading.decimal)
     try:
-        table = read_rows(path, reading.decimal)
         found = text_columns(path, table, None, reading)
     except InputError:
+        if table.header and not table.is_commented:
+            raise
         return None
     if "x_m" not in found.columns:
         return "steps"
     if len(table.columns) in (3, 4) and "header" not in found.said and not table.header:
         # Two or three numbers may as well be a motion.
         return "csv" if reading.columns else None
-    for kind in ("tum", "kitti", "euroc"):
+    for kind in ("tum", "kitti", "euroc") if found.is_certain else ():
         if f"read as {kind}" in found.said:
             return kind
     return "csv"
@@ -119,7 +121,7 @@ def read_motion(path: Path, kind: MotionKind, reading: Reading = PLAIN) -> Drive
         drive = Drive(Trajectory(np.arange(float(n)), integrate(steps)), (*notes, NUMBERED), False)
         return with_times(path, drive, reading)
     step_m = np.hypot(*steps[1:, :2].T)
-    t_s, assumed = seconds(path, table["t_s"], step_m, "s", reading.time_unit)
+    t_s, assumed = seconds(path, table["t_s"], step_m, "s", reading.time_unit, _row)
     order = in_order(path, t_s, steps, _row, is_motion=True)
     poses = Trajectory(t_s[order.rows], integrate(steps[order.rows]))
     return Drive(poses, (*notes, *assumed, *order.notes), True, order.rows, n)
@@ -141,7 +143,7 @@ def _from_array(path: Path, reading: Reading) -> Drive:
         drive = Drive(poses, (*notes, NUMBERED), False, has_handedness=has_handedness)
         return with_times(path, drive, reading)
     step_m = np.hypot(*np.diff(xyt[:, :2], axis=0).T)
-    t_s, assumed = seconds(path, table["t_s"], step_m, "s", reading.time_unit)
+    t_s, assumed = seconds(path, table["t_s"], step_m, "s", reading.time_unit, _row)
     order = in_order(path, t_s, xyt, _row)
     poses = Trajectory(t_s[order.rows], xyt[order.rows])
     return Drive(poses, (*notes, *assumed, *order.notes), True, order.rows, n, has_handedness)

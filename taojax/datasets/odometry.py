@@ -75,7 +75,7 @@ def read_odometry(path: Path, kind: OdometryKind, reading: Reading = PLAIN) -> D
 
 
 def odometry_at(
-    source: Trajectory, t_s: Float[np.ndarray, " t"], gate_s: float
+    source: Trajectory, t_s: Float[np.ndarray, " t"], gate_s: float, name: str = "odometry"
 ) -> tuple[Float[np.ndarray, "t 3"], str | None]:
     """Read the motion between frames off a drive.
 
@@ -83,6 +83,7 @@ def odometry_at(
         source: the drive, in any frame.
         t_s: (T,) stamps of the frames on the same clock, rising.
         gate_s: a frame farther than this from every pose of the drive is not covered by it.
+        name: where the drive comes from, for messages.
 
     Returns:
         (T, 3) forward [m], left [m], yaw [rad] since the frame before, row 0 zero; and a sentence
@@ -97,7 +98,7 @@ def odometry_at(
     share, n_out = float(is_covered.mean()), int((~is_covered).sum())
     if share < LEAST_COVERED:
         raise InputError(
-            f"odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: frames run "
+            f"{name}: odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: frames run "
             f"from {t_s[0]:.3f} to {t_s[-1]:.3f} s, odometry from {source.t_s[0]:.3f} to "
             f"{source.t_s[-1]:.3f} s; {_clock_fix(source.t_s, t_s)}"
         )
@@ -176,10 +177,10 @@ def _read_steps(path: Path, reading: Reading) -> Drive:
         drive = Trajectory(np.arange(float(n)), integrate(steps))
         return Drive(drive, (*notes, NUMBERED), False)
     raw, unit = values_of(path, table, "t_s", found.columns["t_s"])
-    t_s, assumed = seconds(
-        path, raw, np.hypot(*steps[1:, :2].T), unit or found.unit, reading.time_unit
-    )
-    order = in_order(path, t_s, steps, lambda index: f"row {table.lines[index]}", is_motion=True)
+    where = lambda index: f"row {table.lines[index]}"
+    step_m = np.hypot(*steps[1:, :2].T)
+    t_s, assumed = seconds(path, raw, step_m, unit or found.unit, reading.time_unit, where)
+    order = in_order(path, t_s, steps, where, is_motion=True)
     drive = Trajectory(t_s[order.rows], integrate(steps[order.rows]))
     return Drive(drive, (*notes, *assumed, *order.notes), True, order.rows, n)
 

@@ -52,6 +52,9 @@ class Reading:
     decimal: Literal["point", "comma"] | None = None
     """Decimal sign of text."""
 
+    is_shared: bool = False
+    """The words are for several files: one that lies in its usual plane alone is left there."""
+
 
 PLAIN = Reading()
 """Nothing was said."""

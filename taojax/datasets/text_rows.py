@@ -63,8 +63,8 @@ def read_rows(path: Path, decimal: str | None = None) -> TextRows:
         raise fail(path, "the file is empty", "expected rows of numbers")
     first = next((k for k, (_, line) in enumerate(table) if _has_number(line)), len(table))
     if first == len(table):
-        what = f"row {table[0][0]}: no numbers, but {table[0][1].strip()[:80]!r}"
-        raise fail(path, what, "give text with one pose per row")
+        what = f"0 data row(s) below row {table[0][0]}: {table[0][1].strip()[:80]!r}"
+        raise fail(path, what, "at least 2 are needed, with numbers")
     heads, rows = table[:first], table[first:]
     separator, is_comma = _separator(path, rows, decimal)
     cells = [_split(line, separator) for _, line in rows]

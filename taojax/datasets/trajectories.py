@@ -218,13 +218,13 @@ def _few(path: Path, table: TextRows) -> Found:
     if is_heading and (width == 3 or is_clock):
         return Found(_laid(names), f"no header: read as {','.join(names)}")
     is_even = is_clock and 0 < step.max() <= 1.01 * step.min()
-    if width == 3 and is_even and (off is None or off > math.radians(40.0)):
+    if width == 3 and (is_even or rows[0, 0] > 1e8) and off is not None and off > math.radians(40.0):
         return Found(_laid(_OURS[:3]), "no header: read as t_s,x_m,y_m")
     what = f"row {table.lines[0]}: {width} columns without names may be " + (
         "x,y,theta or t,x,y" if width == 3 else "t,x,y,theta, t,x,y,z or x,y,z,theta"
     )
     ours = "x,y,theta" if width == 3 else "t,x,y,theta"
-    raise fail(path, what, f"is no known file of poses without a header: add --columns {ours}")
+    raise fail(path, what, f"name them, such as --columns {ours}, or give a header")
 
 
 def _last_four(table: TextRows) -> np.ndarray:
@@ -265,7 +265,7 @@ def _posed(path: Path, table: TextRows, found: Found, reading: Reading) -> Drive
         frame = value.get("frame", np.arange(float(n)))
         drive = Drive(Trajectory(frame, xyt), tuple(notes), False, has_handedness=has_handedness)
         if reading.times is not None:
-            return with_times(path, drive, reading)
+            return with_times(path, drive, reading, has_numbers="frame" in value)
         order = in_order(path, frame, xyt, where)
         poses = Trajectory(frame[order.rows], xyt[order.rows])
         notes += [NUMBERED, *order.notes]
@@ -274,7 +274,7 @@ def _posed(path: Path, table: TextRows, found: Found, reading: Reading) -> Drive
         raise fail(reading.times, f"poses of {path.name} carry their own stamps",
                    "leave the times away")  # fmt: skip
     unit = said_units["t_s"] or found.unit
-    t_s, assumed = seconds(path, value["t_s"], step_m, unit, reading.time_unit)
+    t_s, assumed = seconds(path, value["t_s"], step_m, unit, reading.time_unit, where)
     order = in_order(path, t_s, xyt, where)
     notes += [*assumed, *order.notes]
     poses = Trajectory(t_s[order.rows], xyt[order.rows])
@@ -299,7 +299,7 @@ def _flat_rows(
         if (odd := np.flatnonzero((away > UNIT_LENGTH) | (np.linalg.det(rotation) < 0))).size:
             what = f"{where(int(odd[0]))}: the first three columns are no rotation"
             raise fail(path, what, "store 3 x 4 matrices row by row: r11 r12 r13 x r21 ...")
-        flat = flat_poses(path, xyz, rotation, reading.plane or "xz", where)
+        flat, notes = _as_told(path, xyz, rotation, "xz", reading, where)
         return flat, notes, reading.plane is not None
     plane = reading.plane or "xy"
     if len(there := [name for name in _Q if name in value]) == 4:
@@ -310,21 +310,39 @@ def _flat_rows(
             raw, declared = np.column_stack([value[name] for name in _Q]), "xyzw"
         words = (declared, found.is_certain)
         q, notes = ordered_quaternions(path, xyz, raw, words, reading, where)
-        return flat_poses(path, xyz, rotations(path, q, where), plane, where), notes, True
+        turn = rotations(path, q, where)
+        flat, more = _as_told(path, xyz, turn, "xy", reading, where)
+        return flat, notes + more, True
     if there:
         what = f"the quaternion has only {', '.join(there)}"
         raise fail(path, what, "store all of qx,qy,qz,qw, or a heading yaw")
-    if plane != "xy":
+    if plane != "xy" and reading.is_shared and _share_out(xyz, 2) <= 0.5:
+        notes.append(f"{path.name}: stays in the plane xy, in which it is driven")
+    elif plane != "xy":
         xyz = np.column_stack([_flat(xyz, plane), xyz[:, 1]])
     if "theta_rad" in value:
         column = own["theta_rad"][0]
-        theta, notes = headings_of(path, xyz[:, :2], value["theta_rad"], column, reading)
-        return np.column_stack([xyz[:, :2], theta]), notes, True
+        theta, more = headings_of(path, xyz[:, :2], value["theta_rad"], column, reading)
+        return np.column_stack([xyz[:, :2], theta]), notes + more, True
     out = _share_out(xyz, 2)
     if "z_m" in value and reading.plane is None and out > 0.5:
         what = f"{out:.0%} of the way leaves the plane xy"
         raise fail(path, what, "add --plane xz for poses of a camera, or --plane xy")
-    return np.column_stack([xyz[:, :2], headings(xyz[:, :2])]), [f"{path.name}: {DERIVED}"], True
+    notes.append(f"{path.name}: {DERIVED}")
+    return np.column_stack([xyz[:, :2], headings(xyz[:, :2])]), notes, True
+
+
+def _as_told(
+    path: Path, xyz: np.ndarray, rotation: np.ndarray, usual: Plane, reading: Reading, where: Where
+) -> tuple[np.ndarray, list[str]]:
+    """Lay poses into the plane that the user names, or the usual one, and say which it was not."""
+    try:
+        return flat_poses(path, xyz, rotation, reading.plane or usual, where), []
+    except InputError:
+        if reading.plane in (None, usual) or not reading.is_shared:
+            raise
+        flat = flat_poses(path, xyz, rotation, usual, where)
+        return flat, [f"{path.name}: stays in the plane {usual}: it does not fit {reading.plane}"]
 
 
 def ordered_quaternions(
@@ -353,6 +371,8 @@ def ordered_quaternions(
     """
     declared, is_certain = words
     plane, flag = reading.plane or "xy", reading.quaternion
+    if reading.is_shared and _share_out(xyz, 2) <= 0.5:
+        plane = "xy"
     as_order = {"xyzw": raw, "wxyz": raw[:, [1, 2, 3, 0]]}
     misfits = {order: _misfit(xyz, q, plane) for order, q in as_order.items()}
     seen = decided(misfits)
@@ -451,13 +471,16 @@ def headings_of(
     return readings[chosen], notes
 
 
-def with_times(path: Path, drive: Drive, reading: Reading) -> Drive:
+def with_times(
+    path: Path, drive: Drive, reading: Reading, *, has_numbers: bool = False
+) -> Drive:
     """Give poses without stamps those of another file, where the user names one.
 
     Args:
         path: where the poses come from.
         drive: frame numbers for stamps.
         reading: the file of stamps and their unit.
+        has_numbers: the file says which frame each pose is of.
 
     Raises:
         InputError: other counts, or a frame without a line.
@@ -468,7 +491,7 @@ def with_times(path: Path, drive: Drive, reading: Reading) -> Drive:
     raw, table = read_stamps(times, reading)
     frame, xyt = drive.poses
     n = len(frame)
-    is_counted = np.array_equal(frame, np.arange(n)) or np.array_equal(frame, np.arange(1, n + 1))
+    is_counted = not has_numbers and bool((np.diff(frame) == 1).all())
     if is_counted and len(raw) != n:
         raise fail(times, f"{len(raw)} stamps for the {n} poses of {path.name}", "pair the files")
     at = np.arange(n) if is_counted else frame
@@ -476,9 +499,9 @@ def with_times(path: Path, drive: Drive, reading: Reading) -> Drive:
         what = f"row {odd[0] + 1}: frame {frame[odd[0]]:g} has no line in {times.name}"
         raise fail(path, what, "pair the files; frames count from 0")
     raw = raw[at.astype(int)]
-    t_s, assumed = seconds(times, raw, np.hypot(*np.diff(xyt[:, :2], axis=0).T), None,
-                           reading.time_unit)  # fmt: skip
     where: Where = lambda index: f"row {table.lines[int(at[index])]}"
+    step_m = np.hypot(*np.diff(xyt[:, :2], axis=0).T)
+    t_s, assumed = seconds(times, raw, step_m, None, reading.time_unit, where)
     order = in_order(times, t_s, xyt, where)
     notes = (*drive.notes, *table.notes, *assumed, *order.notes)
     notes = tuple(note for note in notes if note != NUMBERED)
@@ -693,7 +716,8 @@ def _read_g2o(path: Path, reading: Reading) -> Drive:
         q, said = ordered_quaternions(path, values[:, :3], values[:, 3:], words, reading, where)
         notes += said
         turn = rotations(path, q, where)
-        values = flat_poses(path, values[:, :3], turn, reading.plane or "xy", where)
+        values, more = _as_told(path, values[:, :3], turn, "xy", reading, where)
+        notes += more
     return Drive(Trajectory(stamps, values), (*notes, NUMBERED), False)
 
 

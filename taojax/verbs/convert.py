@@ -162,6 +162,7 @@ def _reading(data: Data, *, is_motion: bool) -> "Reading":
         angles=data.angles,
         columns=columns,
         decimal=data.decimal,
+        is_shared=not is_motion,
     )
 
 
@@ -174,9 +175,11 @@ def _motion(data: Data) -> "Motion | None":
         return None if own is None else recorded_odometry(getattr(data, own))
     reading = _reading(data, is_motion=True)
     if (kind := data.odometry_kind or _kind_of(data.odometry, reading)) is None:
-        raise UsageError(
+        refusal = UsageError if data.odometry.suffix.lower() == ".npy" else InputError
+        raise refusal(
             f"{data.odometry} does not say what it holds; add --odometry-kind: steps (motion from"
-            " frame to frame), poses (where odometry believes to be), or the program that wrote it"
+            " frame to frame), poses (where odometry believes to be), or the program that wrote it;"
+            " or --columns with the names of its columns"
         )
     return Motion(data.odometry, kind, reading, data.clock_offset)
 
