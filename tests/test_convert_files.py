@@ -225,7 +225,7 @@ TOLD = {
     "positions": ("t_s,x_m,y_m\n1,2,3\n", "csv"),
     "steps": ("\ufefft_s,dx_m,dy_m,dtheta_rad\n1,2,3,4\n", "steps"),
     "robotcar": ("source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw\n", "robotcar-vo"),
-    "euroc": ("#timestamp, x\n1403636580838555648,1,2,3,1,0,0,0\n", "euroc"),
+    "euroc": ("#timestamp, x\n1403636580838555648,1,2,3,1,0,0,0\n", "csv"),
     "eight numbers": ("1,2,3,4,0,0,0,1\n", "tum"),
     "three numbers": ("1 2 3\n", None),
     "comments": ("# nothing\n", None),

@@ -32,7 +32,7 @@ SAID = {
 
 
 def convert(folder, out, *more):
-    """Run the command on m.txt, o.txt, q.txt, mv.npy and qv.npy of a folder, or what replaces them."""
+    """Run the command on the five files of a folder, or on what replaces them."""
     named = {"--map-poses": "m.txt", "--odometry": "o.txt", "--query-poses": "q.txt",
              "--map-views": "mv.npy", "--query-views": "qv.npy"}  # fmt: skip
     words = [str(folder / word) if (folder / word).is_file() else word for word in more]
@@ -261,6 +261,23 @@ def test_odometry_that_can_be_read_in_one_way_is_read_and_said(name, plain, tmp_
     assert got[:, 0] == pytest.approx(T_S, abs=1e-6)
     assert got[:, 1:] == pytest.approx(STEPS, abs=2e-4)
     assert said in (tmp_path / "out/about.toml").read_text().replace('\\"', '"')
+
+
+def test_fast_stamps_are_told_by_the_speed_of_many_rows(plain, tmp_path, capsys):
+    fine = np.arange(50 * N - 49) / 50
+    rows = [np.interp(fine, np.arange(N), column) for column in (X, Y, THETA)]
+    stamps = [str(10 * row) for row in range(len(fine))]
+    (plain / "o.txt").write_text(text([stamps, *rows], ",", "stamp,x,y,yaw", form="{:.9f}"))
+    assert convert(plain, tmp_path / "out", "--clock-offset", str(START_S)) == 0
+    assert "o.txt: stamps are recognised as milliseconds, by steps of 10" in capsys.readouterr().err
+    assert moved(tmp_path / "out")[:, 1:] == pytest.approx(STEPS, abs=2e-4)
+
+
+def test_a_unit_that_cannot_be_is_said_to_be_none(plain, tmp_path, capsys):
+    assert convert(plain, tmp_path / "out", "--time-unit", "ns") == 0
+    said = capsys.readouterr().err
+    for name in "moq":
+        assert f"{name}.txt: stamps are seconds, they cannot be nanoseconds" in said
 
 
 REFUSED = {

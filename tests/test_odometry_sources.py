@@ -421,6 +421,27 @@ def test_a_bag_with_several_topics_asks_which(tmp_path):
         message(caught, path, f"no poses on the topic {wrong}; choose a topic of it: /icp")
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda own: [*own[:5], own[6], own[5], *own[7:]],
+            "1 row came late, first topic /odom, message 7",
+        ),
+        (
+            lambda own: [*own[:5], own[4], *own[5:]],
+            "1 row repeats a stamp, first topic /odom, message 6",
+        ),
+    ],
+)
+def test_late_and_repeated_messages_are_put_right_and_said(tmp_path, change, said):
+    topics = {"/odom": (ODOMETRY, change(messages(ROS2, ODOMETRY)))}
+    drive = read_drive(write_bag(tmp_path / "drive", ROS2, topics), "bag")
+    check(drive.poses)
+    assert [note for note in drive.notes if said in note] == list(drive.notes)
+    assert len(drive.notes) == 1
+
+
 def test_a_bag_without_poses_says_what_it_holds(tmp_path):
     text = "std_msgs/msg/String"
     path = write_bag(tmp_path / "drive", ROS2, {"/chatter": (text, [ROS2.types[text]("hello")])})

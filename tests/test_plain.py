@@ -9,8 +9,8 @@ from test_descriptors import codes, save
 from taojax.datasets.convert import recorded_odometry
 from taojax.datasets.descriptors import read_views
 from taojax.datasets.odometry import read_odometry as read_drive
-from taojax.datasets.reading import Reading
 from taojax.datasets.plain import found_in, read_plain, read_traverse
+from taojax.datasets.reading import Reading
 from taojax.errors import InputError
 
 POSE = "t_s,x_m,y_m,theta_rad"

@@ -302,7 +302,7 @@ def test_euroc_stamps_in_another_unit_are_read_and_said(tmp_path, scale, unit):
 def test_euroc_stamps_of_no_known_unit_are_refused_with_the_flag(tmp_path):
     rows = [line.split(",", 1)[1] for line in euroc_lines(8)]
     lines = [f"{stamp},{row}" for stamp, row in zip(stamps(10), rows, strict=True)]
-    with pytest.raises(InputError, match="row 1: .*add --time-unit"):
+    with pytest.raises(InputError, match=r"row 1: .*add --time-unit"):
         read_trajectory(write(tmp_path / "data.csv", lines), "euroc")
 
 

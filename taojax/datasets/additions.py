@@ -11,14 +11,21 @@ from taojax.datasets.convert import Choices, assemble, on_the_clock_of
 from taojax.datasets.descriptors import read_side
 from taojax.datasets.files import NUMBERED, read_poses
 from taojax.datasets.folder import (
-    FAR_M, Lists, Session, about_text, map_parts, origin_of, stamped_text, write_parts,
+    FAR_M,
+    Lists,
+    Session,
+    about_text,
+    map_parts,
+    origin_of,
+    stamped_text,
+    write_parts,
 )  # fmt: skip
 from taojax.datasets.plain import session_of
 from taojax.datasets.reading import PLAIN, Reading
 from taojax.datasets.trajectory import Trajectory, pose_at
 from taojax.errors import InputError
 from taojax.specs import fail
-from taojax.tables import MOTION, POSE, read_table, stacked
+from taojax.tables import MOTION, POSE, read_table
 
 __all__ = ["Added", "add_query", "add_truth", "make_map"]
 

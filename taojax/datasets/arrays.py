@@ -97,7 +97,8 @@ def two_axes(
         rows = array.reshape(left) if len(left) == 2 else array
     if rows.ndim != 2:
         raise fail(path, f"has shape {array.shape}", f"expected {shape}")
-    if rows.shape[0] not in n_rows and rows.shape[1] in n_rows:
+    n, d = tuple[int, ...](rows.shape)
+    if n not in n_rows and d in n_rows:
         rows = rows.T
     if rows is array:
         return rows, ()

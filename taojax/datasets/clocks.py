@@ -7,15 +7,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from taojax.datasets.reading import TimeUnit
 from taojax.datasets.trajectory import driven_m, wrap
 from taojax.specs import fail
 
 __all__ = ["FASTEST_S", "PER_S", "Ordered", "in_order", "offset_of", "seconds"]
 
-PER_S: dict[TimeUnit, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+PER_S: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 
-WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+WORDS: dict[str, str] = {
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+}
 
 FASTEST_S = 5e-4
 """No sensor here stamps faster; closer stamps are in another unit."""
@@ -29,8 +33,11 @@ SLOWEST_MPS, FASTEST_MPS = 0.05, 50.0
 STANDING_MPS = 0.01
 """What drives slower has stamps in another unit."""
 
-LONG_STEP = 10.0
-"""Steps shorter than this many units may well be seconds, or rows."""
+SHORT_STEP, LONG_STEP = 2.0, 10.0
+"""Steps shorter than this many units may well be seconds, or rows: of what hardly moves, of all."""
+
+PIECE_M = 0.25
+"""Speed is measured over pieces of way at least this long."""
 
 LATE_ROWS, LATE_S = 10, 1.0
 """Messages come late by so many steps or seconds; what is later is another recording."""
@@ -44,9 +51,12 @@ Where = Callable[[int], str]
 
 def _speed(t: np.ndarray, step_m: np.ndarray) -> float | None:
     """Return the usual speed while moving, metres per unit; None where nothing moves."""
-    dt = np.diff(t).astype(float)
-    moves = (step_m > 0.02) & (dt > 0)
-    return float(np.median(step_m[moves] / dt[moves])) if moves.any() else None
+    way = np.concatenate([[0.0], np.cumsum(step_m)])
+    if len(way) != len(t) or way[-1] < PIECE_M:
+        return None
+    at = np.unique(np.searchsorted(way, np.arange(0.0, way[-1], max(PIECE_M, way[-1] / 500))))
+    dt = np.diff(t[at]).astype(float)
+    return float(np.median(np.diff(way[at])[dt > 0] / dt[dt > 0])) if (dt > 0).any() else None
 
 
 def seconds(
@@ -54,7 +64,7 @@ def seconds(
     t: Shaped[np.ndarray, " n"],
     step_m: Float[np.ndarray, " m"],
     said: str | None,
-    flag: TimeUnit | None,
+    flag: str | None,
     where: Where,
 ) -> tuple[Float[np.ndarray, " n"], tuple[str, ...]]:
     """Turn stamps of any unit into seconds.
@@ -73,42 +83,49 @@ def seconds(
     Raises:
         InputError: no unit fits, or two do; it names the flag that decides.
     """
+    _check_alike(path, t, where)
     rising = np.diff(t).astype(float)
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
-    top, speed = float(np.abs(np.median(t))), _speed(t, step_m)
-    _check_alike(path, t, where)
-    could = [u for u, per in PER_S.items() if step / per >= FASTEST_S and top / per < 1e11]
-    if step == 0.0:
-        could = [u for u, per in PER_S.items() if top / per < 1e11]
+    unit, said_why = _unit(path, t, step, _speed(t, step_m), (said, flag), where)
+    why = [f"{path.name}: {said_why}"] if said_why else []
+    if flag not in (None, unit):
+        why = [f"{path.name}: stamps are {WORDS[unit]}, they cannot be {WORDS[flag]}"]
+    return t / PER_S[unit], tuple(why)
+
+
+def _unit(
+    path: Path, t: np.ndarray, step: float, speed: float | None,
+    words: tuple[str | None, str | None], where: Where,
+) -> tuple[str, str]:  # fmt: skip
+    """Return the unit of stamps and, where it is news, how it was found."""
+    said, flag = words
+    middle = float(np.abs(np.median(t)))
+    may_be = [u for u, per in PER_S.items() if middle / per < 1e11]
+    could = [u for u in may_be if step / PER_S[u] >= FASTEST_S or step == 0.0]
     drives = [u for u in could if speed is None or SLOWEST_MPS / 10 < speed * PER_S[u] < 150.0]
-    dates = [u for u in could if DATES[0] <= top / PER_S[u] < DATES[1]]
+    dates = [u for u in could if DATES[0] <= middle / PER_S[u] < DATES[1]]
     date = next((u for u in dates if u in drives or len(could) == 1), None)
-    if flag is not None and flag in could and date in (None, flag, "s"):
-        if date != "s" or flag in drives:
-            note = "" if flag == "s" else f"{path.name}: stamps are {WORDS[flag]}, as you say"
-            return t / PER_S[flag], (note,) if note else ()
-    ignored = "" if flag is None else f", which cannot be {WORDS[flag]}"
+    if (
+        flag is not None
+        and flag in could
+        and date in (None, flag, "s")
+        and (date != "s" or flag in drives)
+    ):
+        return flag, "" if flag == "s" else f"stamps are {WORDS[flag]}, as you say"
     if date is not None:
-        is_news = date != (said or "s") or (flag not in (None, date))
-        note = f"{path.name}: stamps are recognised as {WORDS[date]}{ignored}"
-        return t / PER_S[date], (note,) if is_news else ()
-    own: TimeUnit | None = said if said in PER_S else None  # type: ignore[assignment]
-    if own not in (None, "s") and own in could:
-        return t / PER_S[own], ()
+        return date, "" if date == (said or "s") else f"stamps are recognised as {WORDS[date]}"
+    if said not in (None, "s") and said in could:
+        return said, ""
     fits = [u for u in could if speed is None or SLOWEST_MPS <= speed * PER_S[u] < FASTEST_MPS]
+    is_standing = speed is not None and speed < STANDING_MPS and step >= SHORT_STEP
     is_slow = speed is not None and speed < SLOWEST_MPS and step >= LONG_STEP
-    if "s" in could and not is_slow and own in (None, "s"):
-        return t / 1.0, ()
-    if is_slow and "s" in could and own == "s" and speed is not None and speed >= STANDING_MPS:
-        return t / 1.0, ()
-    if len(fits) == 1 and speed is not None and (speed < STANDING_MPS or "s" not in could):
-        note = (
-            f"{path.name}: stamps are recognised as {WORDS[fits[0]]}, by steps of {step:g} and"
-            f" {speed * PER_S[fits[0]]:.2g} m/s{ignored}"
-        )
-        return t / PER_S[fits[0]], (note,)
-    if "s" in could and not fits:
-        return t / 1.0, ()
+    if said in (None, "s") and "s" in could and not is_standing and (said == "s" or not is_slow):
+        return "s", ""
+    if len(fits) == 1 and speed is not None and (is_standing or "s" not in could):
+        how = f"by steps of {step:g} and {speed * PER_S[fits[0]]:.2g} m/s"
+        return fits[0], f"stamps are recognised as {WORDS[fits[0]]}, {how}"
+    if said in (None, "s") and "s" in could and not fits:
+        return "s", ""
     units = " or ".join(WORDS[u] for u in (could or PER_S))
     what = f"{where(0)}: stamp {t[0]:.16g} with steps of {step:g} may be {units}"
     raise fail(path, what, "add --time-unit s, ms, us or ns")
@@ -122,7 +139,9 @@ def _check_alike(path: Path, t: np.ndarray, where: Where) -> None:
     size = np.abs(t).astype(float) / middle
     if (odd := np.flatnonzero(size > 100.0)).size:
         at = int(odd[0])
-        what = f"{where(at)}: stamp {t[at]:.16g} is not of the unit of the others, near {middle:.16g}"
+        what = (
+            f"{where(at)}: stamp {t[at]:.16g} is not of the unit of the others, near {middle:.16g}"
+        )
         raise fail(path, what, "bring all stamps to one unit")
 
 
@@ -167,7 +186,9 @@ def in_order(
     if (odd := np.flatnonzero((off_m > SAME_M) | (off_rad > SAME_RAD))).size:
         at = int(odd[0])
         other, own = sorted((int(order[at]), int(order[first[at]])), reverse=True)
-        what = f"{where(other)}: the stamp of {where(own)} with another pose, {off_m[at]:.2f} m away"
+        what = (
+            f"{where(other)}: the stamp of {where(own)} with another pose, {off_m[at]:.2f} m away"
+        )
         raise fail(path, what, "keep one row per stamp")
     at = int(order[np.flatnonzero(is_twice)[0]])
     n = int(is_twice.sum())

@@ -327,8 +327,8 @@ def _shifted(
     if offset is None:
         return poses, ()
     said = (
-        f"{path.name}: its clock is {abs(offset):.6f} s {'behind' if offset > 0 else 'ahead of'} that"
-        " of the frames, found by equal counts and intervals, and is set right"
+        f"{path.name}: its clock is {abs(offset):.6f} s {'behind' if offset > 0 else 'ahead of'}"
+        " that of the frames, found by equal counts and intervals, and is set right"
     )
     return Trajectory(poses.t_s + offset, poses.xyt), (said,)
 
@@ -397,8 +397,8 @@ def _with_all(
         if order is None:
             at = int(late[0])
             what = (
-                f"data rows {place[at + 1] + 1} and {place[at] + 1} of its poses came late: its rows"
-                " may follow those, or the time"
+                f"data rows {place[at + 1] + 1} and {place[at] + 1} of its poses came late: its"
+                " rows may follow those, or the time"
             )
             raise fail(path, what, "add --views-order rows or --views-order time")
     return Session(session.listed, session.poses, session.has_pose), place[kept]

@@ -16,7 +16,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.datasets.arrays import (
-    blocks, check_begin, check_kind, is_native, kind_notes, map_archive, map_npy, spool, two_axes,
+    blocks,
+    check_begin,
+    check_kind,
+    is_native,
+    kind_notes,
+    map_archive,
+    map_npy,
+    spool,
+    two_axes,
 )  # fmt: skip
 from taojax.datasets.folder import Descriptors, Lists, Session
 from taojax.datasets.frame_names import Names
@@ -192,9 +200,7 @@ def _as_floats(parts: Iterator[np.ndarray], dtype: np.dtype) -> Iterator[np.ndar
         yield rows.astype(np.float32)
 
 
-def _from_h5(
-    path: Path, names: Sequence[str]
-) -> tuple[Float[np.ndarray, "k d"], tuple[str, ...]]:
+def _from_h5(path: Path, names: Sequence[str]) -> tuple[Float[np.ndarray, "k d"], tuple[str, ...]]:
     """Return a checked copy of the descriptors of frames, and what was assumed."""
     with open_features(path, names) as features:
         dtype = features.dtype

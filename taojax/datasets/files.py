@@ -5,6 +5,7 @@
 text       tables with names, TUM, KITTI, EuRoC, g2o, known by header or number of columns
 """
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -16,11 +17,18 @@ from taojax.datasets.arrays import check_begin
 from taojax.datasets.clocks import in_order, seconds
 from taojax.datasets.named_columns import Column
 from taojax.datasets.odometry import OdometryKind, read_odometry
-from taojax.datasets.reading import PLAIN, Drive, Reading
-from taojax.datasets.text_rows import COMMENTS, read_rows
+from taojax.datasets.reading import PLAIN, Drive, Plane, Reading
+from taojax.datasets.text_rows import COMMENTS, TextRows, read_rows
 from taojax.datasets.trajectories import (
-    DERIVED, NUMBERED, flat_poses, headings_of, ordered_quaternions, read_trajectory,
-    rotations, text_columns, with_times,
+    DERIVED,
+    NUMBERED,
+    flat_poses,
+    headings_of,
+    ordered_quaternions,
+    read_trajectory,
+    rotations,
+    text_columns,
+    with_times,
 )  # fmt: skip
 from taojax.datasets.trajectory import Trajectory, headings, integrate
 from taojax.errors import InputError
@@ -59,7 +67,10 @@ def kind_of(path: Path, reading: Reading = PLAIN) -> OdometryKind | None:
         return "robotcar-vo"
     if text[0].startswith(("VERTEX_", "EDGE_", "FIX ")):
         return "g2o"
-    table = read_rows(path, reading.decimal)
+    return _kind_of_table(path, read_rows(path, reading.decimal), reading)
+
+
+def _kind_of_table(path: Path, table: TextRows, reading: Reading) -> OdometryKind | None:
     try:
         found = text_columns(path, table, None, reading)
     except InputError:
@@ -171,13 +182,12 @@ def _laid_flat(
     if reading.plane is not None:
         return flat_poses(path, xyz, turn, reading.plane, _row), (), True
     found = {}
-    for plane in ("xy", "xz"):
-        try:
+    planes: tuple[Plane, ...] = ("xy", "xz")
+    for plane in planes:
+        with contextlib.suppress(InputError):
             found[plane] = flat_poses(path, xyz, turn, plane, _row)
-        except InputError as error:
-            last = error
     if not found:
-        raise last
+        return flat_poses(path, xyz, turn, "xy", _row), (), True
     if len(found) > 1:
         what = "matrices that may be of a vehicle (x forward, z up) or a camera (z forward)"
         raise fail(path, what, "add --plane xy or --plane xz")

@@ -67,8 +67,8 @@ class Features:
             found = self._dataset(int(row))
             if found.shape != self._shape or found.dtype != self.dtype:
                 what = (
-                    f"{self._groups[int(row)]} has {np.prod(found.shape)} numbers of {found.dtype}, but"
-                    f" {self._groups[0]} has {self.dimension} of {self.dtype}"
+                    f"{self._groups[int(row)]} has {np.prod(found.shape)} numbers of {found.dtype},"
+                    f" but {self._groups[0]} has {self.dimension} of {self.dtype}"
                 )
                 raise fail(self._path, what, "use one network for all images")
             found.read(h5py.h5s.ALL, h5py.h5s.ALL, block[at].reshape(self._shape))

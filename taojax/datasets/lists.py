@@ -14,7 +14,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.datasets.arrays import (
-    blocks, check_begin, check_kind, map_archive, map_npy, two_axes,
+    blocks,
+    check_begin,
+    check_kind,
+    map_archive,
+    map_npy,
+    two_axes,
 )  # fmt: skip
 from taojax.datasets.folder import Lists, Session
 from taojax.datasets.frame_names import Names

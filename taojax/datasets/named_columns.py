@@ -35,11 +35,12 @@ SCALE = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "rad": 1.0, "deg": np.pi /
 COMPASS = ("heading", "hdg", "azimuth", "bearing", "course", "cog")
 """Names of headings that may count clockwise from north."""
 
-NOT_A_POSE = frozenset(
-    "linear angular twist velocity vel speed v w b a omega rate acc acceleration accel gyro mag cov"
-    " covariance std sigma stddev var err error bias imu cmd gravity orientation rotation"
-    " quaternion quat orient rot q roll pitch ba bw".split()
-)
+NOT_A_POSE = frozenset((
+    "linear", "angular", "twist", "velocity", "vel", "speed", "v", "w", "b", "a", "omega", "rate",
+    "acc", "acceleration", "accel", "gyro", "mag", "cov", "covariance", "std", "sigma", "stddev",
+    "var", "err", "error", "bias", "imu", "cmd", "gravity", "orientation", "rotation", "quaternion",
+    "quat", "orient", "rot", "q", "roll", "pitch", "ba", "bw",
+))  # fmt: skip
 """Words in front of x, y, z that make it another quantity."""
 
 
@@ -137,7 +138,9 @@ def find_columns(path: Path, names: Sequence[str]) -> dict[str, list[Column]]:
         out[role] = own
     is_placed = {"x_m", "y_m"} <= out.keys() or {"dx_m", "dy_m"} <= out.keys()
     if {"latitude", "longitude"} & out.keys() and not is_placed:
-        what = f"columns {', '.join(out[k][0].name for k in out if k.endswith('itude'))} are degrees"
+        what = (
+            f"columns {', '.join(out[k][0].name for k in out if k.endswith('itude'))} are degrees"
+        )
         raise fail(path, what, "project the positions to metres (UTM), as columns x and y")
     return {k: v for k, v in out.items() if not k.endswith("itude")}
 
@@ -216,9 +219,7 @@ def _date(cell: str) -> float | None:
     return (at if at.tzinfo else at.replace(tzinfo=UTC)).timestamp()
 
 
-def numbers(
-    path: Path, table: TextRows, column: Column, spec: Mapping[str, Any]
-) -> np.ndarray:
+def numbers(path: Path, table: TextRows, column: Column, spec: Mapping[str, Any]) -> np.ndarray:
     """Return a column of finite numbers within the limits of its spec.
 
     Raises:

@@ -98,9 +98,9 @@ def odometry_at(
     share, n_out = float(is_covered.mean()), int((~is_covered).sum())
     if share < LEAST_COVERED:
         raise InputError(
-            f"{name}: odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: frames run "
-            f"from {t_s[0]:.3f} to {t_s[-1]:.3f} s, odometry from {source.t_s[0]:.3f} to "
-            f"{source.t_s[-1]:.3f} s; {_clock_fix(source.t_s, t_s)}"
+            f"{name}: odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: "
+            f"frames run from {t_s[0]:.3f} to {t_s[-1]:.3f} s, odometry from "
+            f"{source.t_s[0]:.3f} to {source.t_s[-1]:.3f} s; {_clock_fix(source.t_s, t_s)}"
         )
     note = None
     if n_out:

@@ -39,7 +39,8 @@ def read_bag(path: Path, *, topic: str | None = None, plane: Plane = "xy") -> Dr
 
     Raises:
         InputError: no bag, no such topic or several, frames that change, a clock that runs back
-            for long, one stamp with two poses, a pose that is not finite or no pose; it names the message, counted from 1.
+            for long, one stamp with two poses, a pose that is not finite or no pose; it names the
+            message, counted from 1.
         MissingExtraError: rosbags is not installed.
     """
     rows, topic = _read_rows(path, topic)

@@ -2,9 +2,9 @@
 
 A 3-D pose is laid flat in one of three ways. `xz` is the camera's: x right, y down, z forward; the
 plane then has x along the camera's z and y along its -x, so that it is right-handed and seen from
-above. `xz-up` is that of a camera with y up and x left. `xy` is that of a z-up frame with x forward,
-as ROS and most lidar programs use it. In all, theta is the direction of the body's forward axis in
-the plane, counter-clockwise.
+above. `xz-up` is that of a camera with y up and x left. `xy` is that of a z-up frame with x
+forward, as ROS and most lidar programs use it. In all, theta is the direction of the body's forward
+axis in the plane, counter-clockwise.
 """
 
 import math
@@ -25,8 +25,19 @@ from taojax.errors import InputError
 from taojax.specs import fail, load_spec, read_text
 
 __all__ = [
-    "DERIVED", "NUMBERED", "Kind", "flat_poses", "looks_like", "read_stamps", "read_trajectory",
-    "headings_of", "ordered_quaternions", "rotations", "row_of", "stamps_s", "text_columns",
+    "DERIVED",
+    "NUMBERED",
+    "Kind",
+    "flat_poses",
+    "headings_of",
+    "looks_like",
+    "ordered_quaternions",
+    "read_stamps",
+    "read_trajectory",
+    "rotations",
+    "row_of",
+    "stamps_s",
+    "text_columns",
     "with_times",
 ]  # fmt: skip
 
@@ -163,41 +174,54 @@ def _laid(names: Sequence[str], first: int = 0) -> dict[str, list[Column]]:
 
 def _by_width(path: Path, table: TextRows, kind: str | None) -> Found:
     """Tell columns without names by their number and by what stands in them."""
-    width, first = len(table.columns), table.columns[0]
-    between = "" if table.separator == " " else f" with {NAMES[table.separator]} between the cells"
-    is_fine = all(cell.isdecimal() and len(cell) >= 15 for cell in (first[0], first[-1]))
-    if kind == "euroc" and 8 <= width <= 17:
-        return Found(_laid(_EUROC), "read as euroc", "ns")
-    if kind in (None, "kitti", "csv") and width in (12, 13, 16, 17):
-        is_square = width >= 16 and all(_last_four(table) == np.array([0.0, 0.0, 0.0, 1.0])[None])
-        if width in (12, 13) and not (is_fine and table.separator == ",") or is_square:
-            begin = width % 2
-            own = _laid(_KITTI, begin) | ({"frame": [Column(0, "frame", None, "")]} if begin else {})
-            return Found(own, f"read as kitti{between}")
-    if kind == "kitti":
-        what = f"row {table.lines[0]}: {width} cells where 12 or 13 are expected"
-        raise fail(path, what, "a KITTI line is a 3 x 4 matrix, row by row")
-    if width == 8 and (kind == "tum" or not (is_fine and table.separator == ",")):
-        return Found(_laid(_TUM), f"read as tum{between}", "s")
-    if 8 <= width <= 17 and is_fine and table.separator == ",":
-        said = "no header, whole stamps: read as euroc"
-        return Found(_laid(_EUROC), said, "ns", is_certain=False)
-    if width in (7, 9) and np.abs(np.linalg.norm(_last_four(table), axis=1) - 1).max() <= 0.01:
-        if width == 9 and _is_count(first):
-            return Found(_laid(_TUM, 1), f"read as tum behind a row number{between}", "s")
-        if width == 7:
-            return Found(_laid(_TUM[1:]), "no header: read as x,y,z,qx,qy,qz,qw")
+    width = len(table.columns)
     if kind == "steps" and width in (3, 4):
         names = ("t_s", "dx_m", "dy_m", "dtheta_rad")[4 - width :]
         return Found(_laid(names), f"no header: read as {','.join(names)}")
     if width in (2, 3, 4) and all(is_number(cell) for column in table.columns for cell in column):
         return _few(path, table)
-    if kind == "tum":
-        what = f"row {table.lines[0]}: {width} cells where 8 are expected"
-        raise fail(path, what, f"a TUM line is t x y z qx qy qz qw; or name the columns {KNOWN}")
+    between = "" if table.separator == " " else f" with {NAMES[table.separator]} between the cells"
+    is_fine = _is_fine(table)
+    if kind == "euroc" and 8 <= width <= 17:
+        return Found(_laid(_EUROC), "read as euroc", "ns")
+    if kind in (None, "kitti", "csv") and (known := _by_matrix(table, between)) is not None:
+        return known
+    if width == 8 and kind != "kitti" and (kind == "tum" or not is_fine):
+        return Found(_laid(_TUM), f"read as tum{between}", "s")
+    if 8 <= width <= 17 and is_fine and kind != "kitti":
+        said = "no header, whole stamps: read as euroc"
+        return Found(_laid(_EUROC), said, "ns", is_certain=False)
+    if (known := _by_quaternion(table, between)) is not None:
+        return known
+    if kind in ("tum", "kitti"):
+        cells = {"tum": "8", "kitti": "12 or 13"}[kind]
+        what = f"row {table.lines[0]}: {width} cells where {cells} are expected"
+        raise fail(path, what, f"leave the kind {kind} away, or name the columns {KNOWN}")
     what = f"row {table.lines[0]}: is no known file of poses: {width} columns without names"
     fix = f"add --columns with {width} names, or a header; known are .npy, a table t_s,x_m,y_m,"
     raise fail(path, what, f"{fix}theta_rad, TUM (8 columns), KITTI (12 or 13), EuRoC and g2o")
+
+
+def _by_matrix(table: TextRows, between: str) -> Found | None:
+    """Know KITTI, with or without a last row 0 0 0 1, perhaps behind a frame number."""
+    width = len(table.columns)
+    is_square = width in (16, 17) and np.all(_last_four(table) == np.array([[0.0, 0, 0, 1]]))
+    if not is_square and (width not in (12, 13) or _is_fine(table)):
+        return None
+    begin = width % 2
+    frame = {"frame": [Column(0, "frame", None, "")]} if begin else {}
+    return Found(_laid(_KITTI, begin) | frame, f"read as kitti{between}")
+
+
+def _by_quaternion(table: TextRows, between: str) -> Found | None:
+    """Know TUM behind a row number or without stamps by its last four columns, of unit length."""
+    width = len(table.columns)
+    is_turn = np.abs(np.linalg.norm(_last_four(table), axis=1) - 1).max() <= UNIT_LENGTH
+    if width == 9 and is_turn and _is_count(table.columns[0]):
+        return Found(_laid(_TUM, 1), f"read as tum behind a row number{between}", "s")
+    if width == 7 and is_turn:
+        return Found(_laid(_TUM[1:]), "no header: read as x,y,z,qx,qy,qz,qw")
+    return None
 
 
 def _few(path: Path, table: TextRows) -> Found:
@@ -218,13 +242,24 @@ def _few(path: Path, table: TextRows) -> Found:
     if is_heading and (width == 3 or is_clock):
         return Found(_laid(names), f"no header: read as {','.join(names)}")
     is_even = is_clock and 0 < step.max() <= 1.01 * step.min()
-    if width == 3 and (is_even or rows[0, 0] > 1e8) and off is not None and off > math.radians(40.0):
+    if (
+        width == 3
+        and (is_even or rows[0, 0] > 1e8)
+        and off is not None
+        and off > math.radians(40.0)
+    ):
         return Found(_laid(_OURS[:3]), "no header: read as t_s,x_m,y_m")
     what = f"row {table.lines[0]}: {width} columns without names may be " + (
         "x,y,theta or t,x,y" if width == 3 else "t,x,y,theta, t,x,y,z or x,y,z,theta"
     )
     ours = "x,y,theta" if width == 3 else "t,x,y,theta"
     raise fail(path, what, f"name them, such as --columns {ours}, or give a header")
+
+
+def _is_fine(table: TextRows) -> bool:
+    """Tell rows that begin with whole stamps of fine units, between commas, as EuRoC writes."""
+    ends = (table.columns[0][0], table.columns[0][-1])
+    return table.separator == "," and all(c.isdecimal() and len(c) >= 15 for c in ends)
 
 
 def _last_four(table: TextRows) -> np.ndarray:
@@ -448,11 +483,11 @@ def headings_of(
         chosen = seen
     elif len(may) == 1:
         chosen = may[0]
-    elif is_small and "compass" not in may:
-        chosen = "rad"
-    elif misfits["rad"] is not None and misfits["rad"] <= FITS_RAD and "compass" not in may:
-        chosen = "rad"
-    elif column.name == "theta_rad":
+    elif (
+        (is_small and "compass" not in may)
+        or (misfits["rad"] is not None and misfits["rad"] <= FITS_RAD and "compass" not in may)
+        or column.name == "theta_rad"
+    ):
         chosen = "rad"
     else:
         what = f"row 2, column {column.name}: may be {', '.join(words[name] for name in may)}"
@@ -462,8 +497,6 @@ def headings_of(
         notes.append(f"{path.name}: column {column.name} is read as {words[chosen]}")
     off = misfits[chosen]
     if off is not None and off > SIDEWAYS_RAD:
-        if column.name == "theta_rad" and np.abs(raw).max() > 2.0 * math.pi:
-            pass
         notes.append(
             f"{path.name}: warning: headings are {math.degrees(off):.0f} degrees off the direction"
             " of motion; check column and unit"
@@ -471,9 +504,7 @@ def headings_of(
     return readings[chosen], notes
 
 
-def with_times(
-    path: Path, drive: Drive, reading: Reading, *, has_numbers: bool = False
-) -> Drive:
+def with_times(path: Path, drive: Drive, reading: Reading, *, has_numbers: bool = False) -> Drive:
     """Give poses without stamps those of another file, where the user names one.
 
     Args:
@@ -509,9 +540,7 @@ def with_times(
     return Drive(poses, notes, True, order.rows, n, drive.has_handedness)
 
 
-def read_stamps(
-    path: Path, reading: Reading = PLAIN
-) -> tuple[Shaped[np.ndarray, " n"], TextRows]:
+def read_stamps(path: Path, reading: Reading = PLAIN) -> tuple[Shaped[np.ndarray, " n"], TextRows]:
     """Read a file of stamps, one per line, perhaps with row numbers or names of images beside.
 
     Args:
@@ -647,7 +676,10 @@ def flat_poses(
     """
     axis, up, other = (0, 2, "xz") if plane == "xy" else (2, 1, "xy")
     ahead = _flat(rotation[:, :, axis], plane)
-    fix = f"try plane {other} (--plane {other}), or give poses of a body that drives along its x (xy) or z (xz) axis"
+    fix = (
+        f"try plane {other} (--plane {other}), or give poses of a body that drives along its x (xy)"
+        " or z (xz) axis"
+    )
     if (odd := np.flatnonzero(np.hypot(*ahead.T) < UPRIGHT)).size:
         what = f"{where(int(odd[0]))}: the forward axis stands upright on the plane {plane}"
         raise fail(path, what, fix)
@@ -685,7 +717,7 @@ def _apart(xyz: np.ndarray) -> list[int]:
 
 
 def _read_g2o(path: Path, reading: Reading) -> Drive:
-    """Read the vertices of a graph in the order of their ids; edges and landmarks are passed over."""
+    """Read the vertices of a graph in the order of their ids; edges, landmarks are passed over."""
     lines = enumerate(map(str.split, read_text(path).splitlines()), 1)
     found = [(row, words) for row, words in lines if words and words[0] in _VERTICES]
     tags = {words[0] for _, words in found}

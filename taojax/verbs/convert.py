@@ -99,9 +99,9 @@ def _check_flags(data: Data) -> None:
     """Refuse flags that contradict each other or ask for nothing."""
     if data.simulate_views and (data.map_views or data.query_views):
         raise UsageError("--simulate-views replaces --map-views and --query-views; drop one")
-    if data.query_views is not None and data.map_views is None:
-        if not isinstance(data, Files) or data.map_poses is not None:
-            raise UsageError("--query-views goes with --map-views")
+    may_lack = isinstance(data, Files) and data.map_poses is None
+    if data.query_views is not None and data.map_views is None and not may_lack:
+        raise UsageError("--query-views goes with --map-views")
     if data.spacing_m is not None and (data.map_frames or data.query_frames):
         raise UsageError("--spacing-m chooses frames by metres; drop it or the numbers of frames")
     for name in ("map_frames", "query_frames", "spacing_m", "gate_s"):
@@ -112,6 +112,11 @@ def _check_flags(data: Data) -> None:
         raise UsageError(f"--least-matched {data.least_matched} is a share from 0 to 1")
     if data.seed < 0:
         raise UsageError(f"--seed {data.seed} must not be negative")
+    _check_motion_flags(data)
+
+
+def _check_motion_flags(data: Data) -> None:
+    """Refuse flags of odometry where none is given."""
     own = ("plane", "time_unit", "quaternion", "angles", "columns", "decimal", "clock_offset")
     own = () if isinstance(data, Files) else own
     for name in ("odometry_kind", "times", "topic", *own):

@@ -61,7 +61,9 @@ class Making:
     clock_offset: Annotated[float | None, flag("S", "found where counts and steps agree")] = None
     """Seconds to add to the stamps of the odometry."""
 
-    quaternion: Annotated[Literal["xyzw", "wxyz"] | None, flag("xyzw|wxyz", "as the kind has it")] = None
+    quaternion: Annotated[
+        Literal["xyzw", "wxyz"] | None, flag("xyzw|wxyz", "as the kind has it")
+    ] = None
     """Order of quaternions, in every file whose direction of motion does not exclude it."""
 
     angles: Annotated[Literal["rad", "deg", "compass"] | None, flag("UNIT", "as names say")] = None
@@ -76,7 +78,9 @@ class Making:
     views_order: Annotated[Literal["rows", "time"] | None, flag("rows|time", "asked")] = None
     """What descriptors follow where rows of poses came late: the rows of that file, or time."""
 
-    plane: Annotated[Literal["xz", "xy", "xz-up"] | None, flag("PLANE", "as the kind has it")] = None
+    plane: Annotated[Literal["xz", "xy", "xz-up"] | None, flag("PLANE", "as the kind has it")] = (
+        None
+    )
     """Axes of the ground in 3-D poses: xz for cameras (y down; xz-up: y up), xy where z is up."""
 
     topic: Annotated[str | None, flag("NAME", "the only one")] = None
@@ -218,8 +222,8 @@ class Files(Making):
     """Data folder to make; or one with a map, to which query or truth are added."""
 
     map_poses: Annotated[Path | None, flag("FILE", "those in OUT")] = None
-    """Poses of the map images: an .npy of (M, 3) x, y, theta or (M, 4) with the stamp first, a table
-    with names such as t,x,y,theta, or what another program wrote."""
+    """Poses of the map images: an .npy of (M, 3) x, y, theta or (M, 4) with the stamp first, a
+    table with names such as t,x,y,theta, or what another program wrote."""
 
     query_poses: Annotated[
         Path | None, _alias("FILE", "nobody knows them: no audit", "--truth-poses")
