@@ -167,7 +167,8 @@ def pooled_share(rows: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     share = float(wrong.sum() / max(total.sum(), 1.0))
     picks = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
     shares = wrong[picks].sum(axis=1) / np.maximum(total[picks].sum(axis=1), 1.0)
-    return share, *(float(q) for q in np.quantile(shares, (0.025, 0.975)))
+    low, high = np.quantile(shares, (0.025, 0.975))
+    return share, float(low), float(high)
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -110,7 +110,8 @@ def read_text(path: Path) -> str:
 def _checked_array(path: Path, label: str, array: Any, spec: Mapping[str, Any]) -> None:
     if not isinstance(array, np.ndarray):
         raise fail(path, f"{label}is not an array", "save it with np.savez")
-    if array.ndim != spec["ndim"]:
+    # Zero stands for any number of axes.
+    if spec["ndim"] and array.ndim != spec["ndim"]:
         what = f"{label}has shape {array.shape}"
         raise fail(path, what, f"expected {spec['shape']}")
     if array.dtype.kind not in spec["kinds"]:

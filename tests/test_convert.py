@@ -71,7 +71,6 @@ def test_help_of_every_set_shows_an_example_and_imports_nothing_heavy():
         (["--simulate-views", "--gate-s", "0"], ["--gate-s"]),
         (["--simulate-views", "--least-matched", "50"], ["--least-matched"]),
         (["--simulate-views", "--seed", "-1"], ["--seed"]),
-        (["--simulate-views", "--odometry", __file__], ["--odometry-kind", "steps"]),
         (["--simulate-views", "--odometry-kind", "tum"], ["--odometry"]),
         (["--simulate-views", "--topic", "/odom"], ["--topic", "--odometry"]),
     ],

@@ -160,24 +160,22 @@ def bad_groups(path, kind):
             group["local"] = codes(1)
         else:
             group["global_descriptor"] = {
-                "shape (1, 5)": codes(1),
+                "shape (2, 5)": codes(2),
                 "dtype int32": np.ones(DIM, np.int32),
                 "has 4 numbers": codes(1)[0][:4],
                 "not finite": np.full(DIM, np.nan, np.float32),
                 "all zero": np.zeros(DIM, np.float32),
-                "big-endian": codes(1)[0].astype(">f4"),
             }[kind]
     return path
 
 
 @pytest.mark.parametrize(
     "kind",
-    ["lacks global_descriptor", "shape (1, 5)", "dtype int32", "not finite", "all zero",
-     "big-endian"],
+    ["lacks global_descriptor", "shape (2, 5)", "dtype int32", "not finite", "all zero"],
 )  # fmt: skip
 def test_a_bad_group_is_named(tmp_path, kind):
     path = bad_groups(tmp_path / "m.h5", kind)
-    refused([kind] if kind == "big-endian" else [kind, "0000.png"], path, path)
+    refused([kind, "0000.png"], path, path)
 
 
 def test_groups_of_two_networks_are_refused(tmp_path):
@@ -215,10 +213,8 @@ BAD_ARRAYS = {
     "NaN": (with_value(np.nan), ["row 4", "0004.png", "not finite"]),
     "more than float32 holds": (with_value(1e300), ["row 4", "not finite"]),
     "a zero row": (with_value(0.0), ["row 4", "all zero"]),
-    "integers": (edited(lambda a: a.astype(np.int32)), ["int32"]),
+    "complex": (edited(lambda a: a.astype(np.complex64)), ["complex64"]),
     "one axis": (edited(lambda a: a[:, 0]), ["(9,)"]),
-    "long double": (edited(lambda a: a.astype(np.longdouble)), ["float32"]),
-    "big-endian": (edited(lambda a: a.astype(">f4")), ["big-endian", "little-endian float32"]),
     "objects": (edited(lambda a: np.array([{}, 1], dtype=object)), ["plain numpy array"]),
     "a pickle": (lambda p: p.write_bytes(pickle.dumps([1])), ["plain numpy array"]),
     "gzip": (lambda p: p.write_bytes(gzip.compress(b"x" * 99)), ["gzip", "unpack"]),
@@ -240,7 +236,7 @@ def test_a_bad_npy_is_one_line_with_row_and_fix(tmp_path, kind):
 
 
 BAD_ARCHIVES = {
-    "no descs": ({"features": codes(N_MAP)}, ["lacks the array descs", "features"]),
+    "no descs": ({"a": codes(N_MAP), "b": codes(N_MAP)}, ["lacks the array descs", "a, b"]),
     "too few paths": ({"descs": codes(N_MAP), "paths": np.array(["a"])}, ["9 descs but 1 paths"]),
     "a path missing": (
         {"descs": codes(N_MAP), "paths": np.array(list("abcdefghi"))},
@@ -248,7 +244,6 @@ BAD_ARCHIVES = {
     ),
     "numbers for paths": ({"descs": codes(N_MAP), "paths": np.arange(9)}, ["paths", "int64"]),
     "objects": ({"descs": np.array([{}], dtype=object)}, ["plain npz"]),
-    "big-endian": ({"descs": codes(N_MAP).astype(">f4")}, ["big-endian"]),
 }
 
 

@@ -163,7 +163,6 @@ BAD_MATRICES = {
     "percent": (matrix() * 100, ["row 0", "larger than 1", "rescale"]),
     "NaN": (np.where(np.eye(N_QUERY, N_MAP) > 0, np.nan, 0.5), ["row 0, column 0", "not finite"]),
     "integers": (np.ones((N_QUERY, N_MAP), int), ["int64"]),
-    "big-endian": (matrix().astype(">f4"), ["little-endian float32"]),
 }
 
 

@@ -7,13 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taojax.datasets.trajectories import read_trajectory, stamps_s
+from taojax.datasets.reading import Reading
+from taojax.datasets.trajectories import read_trajectory as read_drive
+from taojax.datasets.trajectories import stamps_s
 from taojax.datasets.trajectory import integrate, motions
 from taojax.errors import InputError
 from taojax.specs import load_spec
 
 START_S = 1_600_000_000.0
 N = 40
+
+
+def read_trajectory(path, kind, **told):
+    """Return the poses alone; what is said about them has tests of its own."""
+    return read_drive(path, kind, Reading(**told)).poses
 
 
 def left_turning_drive():
@@ -163,7 +170,8 @@ def test_times_that_do_not_pair_with_the_poses_are_refused(tmp_path):
     lines = [f"{0.5 * i} {row}" for i, row in enumerate(kitti_lines())]
     with pytest.raises(InputError, match=r"row 2: frame 0\.5 has no line in times\.txt"):
         read_trajectory(write(tmp_path / "01.txt", lines), "kitti", times=times)
-    with pytest.raises(InputError, match="tum poses carry their own stamps"):
+    path = write(tmp_path / "02.txt", tum_lines())
+    with pytest.raises(InputError, match=r"poses of 02\.txt carry their own stamps"):
         read_trajectory(path, "tum", times=times)
 
 
@@ -216,23 +224,16 @@ def faulty(kind, fault):
     if fault == "nan":
         lines[4] = cut.join([*cells[:3], "nan", *cells[4:]])
     elif fault == "infinite":
-        lines[4] = cut.join([*cells[:-1], "inf"])
+        lines[4] = cut.join([*cells[:2], "inf", *cells[3:]])
     elif fault == "word":
-        lines[4] = cut.join([*cells[:-1], "north"])
+        lines[4] = cut.join([*cells[:2], "north", *cells[3:]])
     elif fault == "missing column":
         lines[4] = cut.join(cells[:-1])
-    elif fault == "reversed time":
-        lines[4], lines[5] = lines[5], lines[4]
-    elif fault == "duplicate stamp":
-        lines.insert(5, lines[4])
-    row = 6 if fault in ("reversed time", "duplicate stamp") else 5
-    return "\n".join(lines).encode(), row
+    return "\n".join(lines).encode(), 5
 
 
 @pytest.mark.parametrize("kind", LINES)
-@pytest.mark.parametrize(
-    "fault", ["nan", "infinite", "word", "missing column", "reversed time", "duplicate stamp"]
-)
+@pytest.mark.parametrize("fault", ["nan", "infinite", "word", "missing column"])
 def test_a_fault_is_named_by_file_row_and_fix(tmp_path, kind, fault):
     path = tmp_path / "poses.txt"
     raw, row = faulty(kind, fault)
@@ -277,24 +278,31 @@ def test_one_pose_is_no_drive(tmp_path, kind):
 @pytest.mark.parametrize(
     ("scale", "unit"), [(10**9, "nanoseconds"), (10**6, "microseconds"), (10**3, "milliseconds")]
 )
-def test_stamps_that_cannot_be_seconds_are_called_by_their_unit(tmp_path, kind, scale, unit):
+def test_stamps_that_cannot_be_seconds_are_read_in_their_unit(tmp_path, kind, scale, unit):
     lines, cut = LINES[kind](), SEPARATOR[kind]
     head, rows = lines[: kind == "csv"], lines[kind == "csv" :]
     rows = [
         cut.join([s, line.split(cut, 1)[1]]) for s, line in zip(stamps(scale), rows, strict=True)
     ]
     path = write(tmp_path / "poses", ["# a comment", *rows] if kind == "tum" else [*head, *rows])
-    with pytest.raises(InputError, match=f"poses: row 2: stamp .* it looks like {unit}; convert"):
-        read_trajectory(path, kind)
+    drive = read_drive(path, kind)
+    check(drive.poses)
+    assert f"poses: stamps are recognised as {unit}" in drive.notes
 
 
-@pytest.mark.parametrize(
-    ("scale", "unit"), [(10**6, "microseconds"), (10**3, "milliseconds"), (10, "seconds")]
-)
-def test_euroc_stamps_in_another_unit_are_refused(tmp_path, scale, unit):
+@pytest.mark.parametrize(("scale", "unit"), [(10**6, "microseconds"), (10**3, "milliseconds")])
+def test_euroc_stamps_in_another_unit_are_read_and_said(tmp_path, scale, unit):
     rows = [line.split(",", 1)[1] for line in euroc_lines(8)]
     lines = [f"{stamp},{row}" for stamp, row in zip(stamps(scale), rows, strict=True)]
-    with pytest.raises(InputError, match=f"row {N}: .*not in nanoseconds, it looks like {unit}"):
+    drive = read_drive(write(tmp_path / "data.csv", lines), "euroc")
+    check(drive.poses)
+    assert f"data.csv: stamps are recognised as {unit}" in drive.notes
+
+
+def test_euroc_stamps_of_no_known_unit_are_refused_with_the_flag(tmp_path):
+    rows = [line.split(",", 1)[1] for line in euroc_lines(8)]
+    lines = [f"{stamp},{row}" for stamp, row in zip(stamps(10), rows, strict=True)]
+    with pytest.raises(InputError, match=r"row 1: .*add --time-unit"):
         read_trajectory(write(tmp_path / "data.csv", lines), "euroc")
 
 
@@ -302,7 +310,7 @@ def test_euroc_stamps_with_decimals_or_too_many_digits_are_refused(tmp_path):
     for stamp in ("1600000000.1", "1" * 30):
         lines = euroc_lines(8)
         lines[4] = ",".join([stamp, *lines[4].split(",")[1:]])
-        with pytest.raises(InputError, match="row 5, column t_ns"):
+        with pytest.raises(InputError, match="row 5"):
             read_trajectory(write(tmp_path / "data.csv", lines), "euroc")
 
 

@@ -2,26 +2,31 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.datasets.descriptors import read_views, view_notes
-from taojax.datasets.files import NUMBERED, Drive, MotionKind, read_motion
+from taojax.datasets.clocks import offset_of
+from taojax.datasets.descriptors import goes_by_name, read_views, view_notes
+from taojax.datasets.files import NUMBERED, MotionKind, read_motion
 from taojax.datasets.folder import FAR_M, Descriptors, Lists, Session, write_folder
-from taojax.datasets.odometry import odometry_at, simulated
+from taojax.datasets.odometry import LEAST_COVERED, odometry_at, simulated
+from taojax.datasets.plain import session_of
+from taojax.datasets.reading import PLAIN, Drive, Reading
 from taojax.datasets.simulate import WorldConfig, describe_routes
-from taojax.datasets.trajectories import Plane
-from taojax.datasets.trajectory import Trajectory, driven_m, every, spaced
+from taojax.datasets.trajectory import Trajectory, driven_m, every, motions, pose_at, spaced
 from taojax.errors import InputError
 from taojax.specs import fail
 
 __all__ = [
+    "Assembled",
     "Choices",
     "Made",
     "Motion",
+    "assemble",
     "make_folder",
+    "on_the_clock_of",
     "recorded_odometry",
     "recorded_views",
 ]
@@ -45,14 +50,11 @@ class Motion:
     kind: MotionKind
     """Its format, as `read_motion` names it."""
 
-    times: Path | None = None
-    """Stamps of a format that has none."""
+    reading: Reading = PLAIN
+    """What the user says of the file."""
 
-    plane: Plane | None = None
-    """Which two axes are the ground, in a format of 3-D poses."""
-
-    topic: str | None = None
-    """Of a bag."""
+    offset_s: float | None = None
+    """To add to its stamps [s]; None: found where it can be found."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,9 @@ class Choices:
 
     views: tuple[Path, Path | None] | None = None
     """Descriptors of map and query, or one file that answers for both; None: simulated."""
+
+    views_order: Literal["rows", "time"] | None = None
+    """What rows of descriptors follow where those of the poses came late; None: refused there."""
 
     seed: int = 0
     """Of everything that is simulated."""
@@ -146,6 +151,39 @@ def make_folder(out: Path, given: tuple[Session, Session | None], choices: Choic
     """
     if out.exists():
         raise InputError(f"{out}: exists already; choose a new folder")
+    made = assemble(out, given, choices)
+    write_folder(
+        out, made.mapped, (made.query.t_s, made.odometry), made.views, truth=made.truth,
+        notes=made.notes,
+    )  # fmt: skip
+    way_m = tuple(float(driven_m(drive.xyt)[-1]) for drive in (made.mapped, made.query))
+    return Made((len(made.mapped.t_s), len(made.query.t_s)), (way_m[0], way_m[1]), made.notes)
+
+
+class Assembled(NamedTuple):
+    """All that goes into a data folder."""
+
+    mapped: Trajectory
+    query: Trajectory
+    """Where odometry alone is known, what it believes."""
+
+    odometry: Float[np.ndarray, "t 3"]
+    views: Descriptors | Lists
+    truth: Float[np.ndarray, "t 3"] | None
+    notes: tuple[str, ...]
+
+
+def assemble(out: Path, given: tuple[Session, Session | None], choices: Choices) -> Assembled:
+    """Choose frames, read odometry off its file and bring views to the frames.
+
+    Args:
+        out: the data folder, for messages.
+        given: as `make_folder` has it.
+        choices: the same.
+
+    Raises:
+        InputError: as `make_folder`, but for `out`.
+    """
     drive = None if choices.motion is None else _read(choices.motion)
     sessions = given[0], given[1] or _only_driven(drive)
     kept = (
@@ -165,12 +203,14 @@ def make_folder(out: Path, given: tuple[Session, Session | None], choices: Choic
             f"{out}: nothing can be simulated for a query without poses; give --odometry and views"
         )
     odometry, moved = _odometry(sessions[1], query, choices, drive)
+    if given[1] is not None and given[1].has_pose and drive is not None:
+        odometry, turned = _of_one_hand(odometry, query.xyt, drive, choices)
+        moved += turned
     views, seen = _views(sessions, kept, (mapped, query), choices)
-    notes = (*_notes(sessions, kept), *moved, *seen)
-    truth = query.xyt if is_known else None
-    write_folder(out, mapped, (query.t_s, odometry), views, truth=truth, notes=notes)
-    way_m = tuple(float(driven_m(drive.xyt)[-1]) for drive in (mapped, query))
-    return Made((len(mapped.t_s), len(query.t_s)), (way_m[0], way_m[1]), notes)
+    own = () if given[1] is None or drive is None else drive.notes
+    own = tuple(note for note in own if note != NUMBERED)
+    notes = tuple(dict.fromkeys((*_notes(sessions, kept), *own, *moved, *views.notes, *seen)))
+    return Assembled(mapped, query, odometry, views, query.xyt if is_known else None, notes)
 
 
 def _chosen(
@@ -200,9 +240,7 @@ def _check_one_place(mapped: Trajectory, query: Trajectory) -> None:
 
 
 def _read(motion: Motion) -> Drive:
-    return read_motion(
-        motion.path, motion.kind, times=motion.times, plane=motion.plane, topic=motion.topic
-    )
+    return read_motion(motion.path, motion.kind, motion.reading)
 
 
 def _only_driven(drive: Drive | None) -> Session:
@@ -211,8 +249,7 @@ def _only_driven(drive: Drive | None) -> Session:
         raise InputError(
             "the query has neither poses nor odometry; give --query-poses, --odometry or both"
         )
-    names = tuple(f"{row:06d}" for row in range(len(drive.poses.t_s)))
-    return Session(names, drive.poses, False, drive.notes)
+    return session_of(drive, has_pose=False)
 
 
 def _odometry(
@@ -222,23 +259,106 @@ def _odometry(
         steps, said = simulated(query.xyt, choices.seed)
         along = "" if session.has_pose else ", along the route progress"
         return steps, (f"{said}{along}",)
-    source = _on_the_clock_of(session, drive, motion.path)
-    steps, said = odometry_at(source, query.t_s, choices.gate_s)
+    source, paired = on_the_clock_of(
+        session, drive, motion.path, gate_s=choices.gate_s, offset_s=motion.offset_s
+    )
+    steps, said = odometry_at(source, query.t_s, choices.gate_s, str(motion.path))
     named = f"odometry from {motion.path.name} ({motion.kind})"
-    return steps, (named,) if said is None else (named, said)
+    return steps, (named, *paired, *(() if said is None else (said,)))
 
 
-def _on_the_clock_of(session: Session, drive: Drive, path: Path) -> Trajectory:
-    """Pair odometry and frames row by row where one of them has no stamps."""
-    n_frames, n_rows = len(session.frames), len(drive.poses.t_s)
-    if drive.has_stamps and NUMBERED not in session.notes:
-        return drive.poses
-    if n_frames == n_rows:
-        return Trajectory(session.poses.t_s, drive.poses.xyt)
-    if path.suffix.lower() == ".npy" and not drive.has_stamps:
-        what = f"{n_rows} rows without stamps, but the query has {n_frames} frames"
-        raise fail(path, what, "store one row per frame, or stamps in a first column")
-    return drive.poses
+def on_the_clock_of(
+    session: Session, drive: Drive, path: Path, *, gate_s: float, offset_s: float | None = None
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """Bring a drive onto the clock of a session's frames.
+
+    Args:
+        session: the frames.
+        drive: poses on any clock, or without stamps.
+        path: where the drive comes from.
+        gate_s: how far a pose may be from a frame, seconds.
+        offset_s: what the user wants added to the drive's stamps; None finds it.
+
+    Returns:
+        Poses on the clock of the frames, and what was assumed.
+
+    Raises:
+        InputError: no stamps and other counts.
+    """
+    poses, frames_s = drive.poses, session.poses.t_s
+    n_rows, is_numbered = len(poses.t_s), NUMBERED in session.notes
+    if offset_s is not None and drive.has_stamps:
+        shifted = Trajectory(poses.t_s + offset_s, poses.xyt)
+        return shifted, (f"{path.name}: {offset_s:.6f} s are added to its stamps, as you say",)
+    if drive.has_stamps and not is_numbered:
+        return _shifted(frames_s, drive, path, gate_s)
+    without = "the query frames have" if drive.has_stamps else f"{path.name} has"
+    rows = _paired_rows(session, n_rows)
+    if rows is not None:
+        said = f"{path.name}: paired with the query frames row by row, as {without} no time stamps"
+        return Trajectory(frames_s, poses.xyt[rows]), (said,)
+    has_gaps = bool((np.diff(poses.t_s) != 1).any())
+    if not drive.has_stamps and is_numbered and has_gaps:
+        said = f"{path.name}: its row numbers are those of the query frames"
+        return poses, (said,)
+    what = f"{n_rows} rows {'with' if drive.has_stamps else 'without'} stamps, but the query has"
+    what += f" {len(frames_s)} frames{' without' if is_numbered else ''}"
+    raise fail(path, what, "store one row per frame, or stamps in a first column of both")
+
+
+def _paired_rows(session: Session, n_rows: int) -> Int[np.ndarray, " t"] | None:
+    """Return the row of each frame in a file of as many rows as there are frames, else None."""
+    if n_rows == len(session.frames):
+        return np.arange(n_rows)
+    if n_rows == len(session.listed):
+        row_of = {name: row for row, name in enumerate(session.listed)}
+        return np.array([row_of[name] for name in session.frames])
+    return None
+
+
+def _shifted(
+    frames_s: np.ndarray, drive: Drive, path: Path, gate_s: float
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """Shift a clock that covers hardly any frame, where counts and intervals agree."""
+    poses = drive.poses
+    if pose_at(poses, frames_s, gate_s)[1].mean() >= LEAST_COVERED:
+        return poses, ()
+    offset = offset_of(poses.t_s, frames_s, gate_s)
+    if offset is None:
+        return poses, ()
+    said = (
+        f"{path.name}: its clock is {abs(offset):.6f} s {'behind' if offset > 0 else 'ahead of'}"
+        " that of the frames, found by equal counts and intervals, and is set right"
+    )
+    return Trajectory(poses.t_s + offset, poses.xyt), (said,)
+
+
+MIRRORED = -0.7
+"""Turns that go so much against the true ones are turns of a mirrored frame."""
+
+
+def _of_one_hand(
+    odometry: Float[np.ndarray, "t 3"],
+    truth: Float[np.ndarray, "t 3"],
+    drive: Drive,
+    choices: Choices,
+) -> tuple[Float[np.ndarray, "t 3"], tuple[str, ...]]:
+    """Hold left and right of the odometry against the true poses.
+
+    Returns:
+        The odometry, mirrored where its format leaves open which side is left; else as it is, with
+        a warning where it turns the other way.
+    """
+    own, true = odometry[1:, 2], motions(truth)[1:, 2]
+    size = float(np.sqrt((own**2).sum() * (true**2).sum()))
+    if size < 0.01 or float((own * true).sum()) > MIRRORED * size or choices.motion is None:
+        return odometry, ()
+    name = choices.motion.path.name
+    if not drive.has_handedness:
+        said = "it turns against the true poses, so that the camera's y is up; else add --plane xz"
+        return odometry * np.array([[1.0, -1.0, -1.0]]), (f"{name}: laid flat as xz-up: {said}",)
+    said = "turns left where the true poses turn right; check the sign of yaw and of y"
+    return odometry, (f"{name}: warning: {said}",)
 
 
 def _views(
@@ -248,7 +368,11 @@ def _views(
     choices: Choices,
 ) -> tuple[Descriptors | Lists, tuple[str, ...]]:
     if choices.views is not None:
-        whole = [_with_all(*side) for side in zip(sessions, kept, strict=True)]
+        files = choices.views[0], choices.views[1] or choices.views[0]
+        whole = [
+            _with_all(*side, choices.views_order)
+            for side in zip(files, sessions, kept, strict=True)
+        ]
         views = read_views(*choices.views, (whole[0][0], whole[1][0]), (whole[0][1], whole[1][1]))
         return views, view_notes(*choices.views)
     # The simulation measures distances: a local origin keeps them exact.
@@ -260,14 +384,24 @@ def _views(
 
 
 def _with_all(
-    session: Session, kept: Int[np.ndarray, " k"]
+    path: Path, session: Session, kept: Int[np.ndarray, " k"], order: str | None
 ) -> tuple[Session, Int[np.ndarray, " k"]]:
     """Return a session of all images, also those without a pose, and the kept ones' rows in it."""
-    if len(session.listed) in (0, len(session.frames)):
+    if not session.listed or session.listed == session.frames:
         return session, kept
     row_of = {name: row for row, name in enumerate(session.listed)}
-    rows = np.array([row_of[session.frames[row]] for row in kept], np.int64)
-    return Session(session.listed, session.poses, session.has_pose), rows
+    place = np.array([row_of[name] for name in session.frames], np.int64)
+    if (late := np.flatnonzero(np.diff(place) < 0)).size and not goes_by_name(path):
+        if order == "time":
+            return Session(session.frames, session.poses, session.has_pose), kept
+        if order is None:
+            at = int(late[0])
+            what = (
+                f"data rows {place[at + 1] + 1} and {place[at] + 1} of its poses came late: its"
+                " rows may follow those, or the time"
+            )
+            raise fail(path, what, "add --views-order rows or --views-order time")
+    return Session(session.listed, session.poses, session.has_pose), place[kept]
 
 
 def _notes(

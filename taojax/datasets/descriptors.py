@@ -7,6 +7,7 @@
 Nothing is loaded whole: chosen rows are a view of the file or a copy in a temporary file (TMPDIR).
 """
 
+import zipfile
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,14 +15,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.datasets.arrays import blocks, check_begin, check_kind, map_archive, map_npy, spool
+from taojax.datasets.arrays import (
+    blocks,
+    check_begin,
+    check_kind,
+    is_native,
+    kind_notes,
+    map_archive,
+    map_npy,
+    spool,
+    two_axes,
+)  # fmt: skip
 from taojax.datasets.folder import Descriptors, Lists, Session
 from taojax.datasets.frame_names import Names
 from taojax.datasets.hloc import H5_SUFFIXES, open_features
 from taojax.datasets.lists import has_scores, read_lists
 from taojax.specs import fail
 
-__all__ = ["read_views", "view_notes"]
+__all__ = ["goes_by_name", "read_side", "read_views", "view_notes"]
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
 """Endings of names that sort as image files do."""
@@ -50,14 +61,25 @@ def read_views(
     if query_path is None and map_path.suffix.lower() not in H5_SUFFIXES:
         return read_lists(map_path, sessions, kept)
     paths = (map_path, map_path if query_path is None else query_path)
-    sides = [
-        _read_side(path, session.frames, rows)
+    (of_map, said), (of_query, more) = (
+        read_side(path, session.frames, rows)
         for path, session, rows in zip(paths, sessions, kept, strict=True)
-    ]
-    if sides[0].shape[1] != sides[1].shape[1]:
-        what = f"dimension {sides[1].shape[1]}, but {paths[0]} has {sides[0].shape[1]}"
+    )
+    if of_map.shape[1] != of_query.shape[1]:
+        what = f"dimension {of_query.shape[1]}, but {paths[0]} has {of_map.shape[1]}"
         raise fail(paths[1], what, "use the same network for both")
-    return Descriptors(*sides)
+    return Descriptors(of_map, of_query, (*said, *more))
+
+
+def goes_by_name(path: Path) -> bool:
+    """Tell whether a file names the image of each row, so that their order does not matter."""
+    if path.suffix.lower() in (*H5_SUFFIXES, ".csv", ".txt"):
+        return True
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return path.suffix.lower() == ".npz" and "paths.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def view_notes(map_path: Path, query_path: Path | None) -> tuple[str, ...]:
@@ -70,8 +92,22 @@ def view_notes(map_path: Path, query_path: Path | None) -> tuple[str, ...]:
     return ()
 
 
-def _read_side(path: Path, frames: Sequence[str], kept: np.ndarray) -> Float[np.ndarray, "k d"]:
-    """Return the descriptors of the frames that stay, in their order."""
+def read_side(
+    path: Path, frames: Sequence[str], kept: np.ndarray
+) -> tuple[Float[np.ndarray, "k d"], tuple[str, ...]]:
+    """Read the descriptors of one session.
+
+    Args:
+        path: .npy, .npz or .h5.
+        frames: names of all frames.
+        kept: rows of those that stay.
+
+    Returns:
+        (K, D) rows of the frames that stay, in their order, and what was assumed.
+
+    Raises:
+        InputError: naming file, row or frame, and what to do.
+    """
     check_begin(path)
     names = [frames[int(row)] for row in kept]
     if len(names) < 3:
@@ -79,21 +115,26 @@ def _read_side(path: Path, frames: Sequence[str], kept: np.ndarray) -> Float[np.
     suffix = path.suffix.lower()
     if suffix in H5_SUFFIXES:
         return _from_h5(path, names)
+    may_be = (len(frames), len(kept))
     if suffix == ".npy":
-        array = map_npy(path, "descriptors")
-        return _from_array(path, array, _by_order(path, len(array), frames, kept), names)
+        array, said = two_axes(path, map_npy(path, "views"), may_be, "(rows, D) float32")
+        rows = _by_order(path, len(array), frames, kept)
+        return _from_array(path, array, rows, names), (*said, *kind_notes(path, array.dtype))
     if suffix != ".npz":
         known = f"use .npy, .npz or {' or '.join(H5_SUFFIXES)}"
         raise fail(path, f"is no known file of descriptors ({suffix or 'no ending'})", known)
     arrays = map_archive(path, "descriptor_archive")
-    array = arrays["descs"]
-    check_kind(path, array.dtype)
-    if "paths" not in arrays:
-        return _from_array(path, array, _by_order(path, len(array), frames, kept), names)
+    has_names = "paths" in arrays
+    n_named = (len(arrays["paths"]),) if has_names else may_be
+    array, said = two_axes(path, arrays["descs"], n_named, "(rows, D) float32")
+    said += kind_notes(path, array.dtype)
+    if not has_names:
+        rows = _by_order(path, len(array), frames, kept)
+        return _from_array(path, array, rows, names), said
     if len(arrays["paths"]) != len(array):
         what = f"{len(array)} descs but {len(arrays['paths'])} paths"
         raise fail(path, what, "store one path per row")
-    return _from_array(path, array, _by_name(path, arrays["paths"], names), names)
+    return _from_array(path, array, _by_name(path, arrays["paths"], names), names), said
 
 
 def _by_order(
@@ -138,24 +179,41 @@ def _from_array(
     """Return checked rows of a mapped array: a view where they are evenly spaced, else a copy."""
     labels = [f"row {row} (from 0), frame {name}" for row, name in zip(rows, names, strict=True)]
     parts = (array[some] for some in blocks(rows, array.itemsize * array.shape[1]))
+    shape = (len(rows), array.shape[1])
+    if not is_native(array.dtype):
+        floats = _as_floats(_checked(path, parts, labels), array.dtype)
+        return spool(path, floats, shape, np.dtype(np.float32))
     stride = int(rows[1] - rows[0])
     if stride > 0 and np.all(np.diff(rows) == stride):
         for _ in _checked(path, parts, labels):
             pass
         return array[int(rows[0]) : int(rows[-1]) + 1 : stride]
-    shape = (len(rows), array.shape[1])
     return spool(path, _checked(path, parts, labels), shape, array.dtype)
 
 
-def _from_h5(path: Path, names: Sequence[str]) -> Float[np.ndarray, "k d"]:
-    """Return a checked copy of the descriptors of frames."""
+def _as_floats(parts: Iterator[np.ndarray], dtype: np.dtype) -> Iterator[np.ndarray]:
+    """Yield blocks as float32; whole numbers, which have no scale of their own, at unit length."""
+    for part in parts:
+        rows = np.asarray(part, np.float64)
+        if dtype.kind != "f":
+            rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        yield rows.astype(np.float32)
+
+
+def _from_h5(path: Path, names: Sequence[str]) -> tuple[Float[np.ndarray, "k d"], tuple[str, ...]]:
+    """Return a checked copy of the descriptors of frames, and what was assumed."""
     with open_features(path, names) as features:
-        check_kind(path, features.dtype)
+        dtype = features.dtype
+        check_kind(path, dtype)
         shape = (len(names), features.dimension)
-        some = blocks(np.arange(len(names)), features.dtype.itemsize * features.dimension)
+        some = blocks(np.arange(len(names)), dtype.itemsize * features.dimension)
         parts = (features.read(rows) for rows in some)
         labels = [f"frame {name}" for name in names]
-        return spool(path, _checked(path, parts, labels), shape, features.dtype)
+        rows = _checked(path, parts, labels)
+        if is_native(dtype):
+            return spool(path, rows, shape, dtype), features.notes
+        floats = spool(path, _as_floats(rows, dtype), shape, np.dtype(np.float32))
+        return floats, (*features.notes, *kind_notes(path, dtype))
 
 
 def _checked(
@@ -165,7 +223,7 @@ def _checked(
     start = 0
     for part in parts:
         with np.errstate(invalid="ignore"):
-            size = np.max(np.abs(part), axis=1)
+            size = np.max(np.abs(part.astype(float) if part.dtype.kind != "f" else part), axis=1)
         # What float32 cannot hold would turn infinite on the way.
         wrong = ~(size <= np.finfo(np.float32).max)
         for is_bad, what in ((wrong, "is not finite"), (size == 0, "is all zero")):

@@ -1,7 +1,8 @@
 """Sessions in, one data folder out: whole or not at all."""
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +14,16 @@ from taojax.errors import InputError
 from taojax.parts import locked_part
 from taojax.tables import MOTION, POSE, table_text
 
-__all__ = ["Descriptors", "Lists", "Session", "stamped_text", "write_folder"]
+__all__ = [
+    "Descriptors", "Lists", "Session", "about_text", "map_parts", "origin_of", "stamped_text",
+    "write_folder", "write_parts",
+]  # fmt: skip
 
 BLOCK_ROWS = 4096
 """Descriptors are copied so many at a time: a map may be larger than the memory."""
+
+ORIGIN = re.compile(r"local origin: x = (\S+) m and y = (\S+) m ")
+"""How the notes name what was subtracted."""
 
 FAR_M = 1e5
 """Coordinates farther from the origin lose centimetres in float32."""
@@ -52,6 +59,9 @@ class Descriptors:
     query_rows: Float[np.ndarray, "t d"]
     """(T, D), may be memory-mapped."""
 
+    notes: tuple[str, ...] = ()
+    """What was assumed of their files."""
+
 
 @dataclass(frozen=True)
 class Lists:
@@ -62,6 +72,9 @@ class Lists:
 
     similarity: Float[np.ndarray, "t k"]
     """(T, K) at most 1."""
+
+    notes: tuple[str, ...] = ()
+    """What was assumed of their file."""
 
 
 def write_folder(  # noqa: PLR0913 - what a folder holds
@@ -91,39 +104,84 @@ def write_folder(  # noqa: PLR0913 - what a folder holds
     """
     if out.exists():
         raise InputError(f"{out}: exists already; choose a new folder")
+    # The truth of a drive that is its own map lies in a frame of its own.
+    origin, moved = _origin(mapped.xyt, truth if own_gap_m is None else None)
+    own_gap = "" if own_gap_m is None else f"own_gap_m = {own_gap_m}\n"
+    texts = {
+        "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
+        "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
+        "about.toml": about_text([*notes, *moved]) + own_gap,
+    }
+    if truth is not None:
+        rows = truth - origin
+        texts["truth/query_poses.csv"] = stamped_text("query_poses", POSE, query[0], rows)
+    write_parts(out, texts, views_parts(views))
+
+
+def about_text(notes: Iterable[str]) -> str:
+    """Return about.toml with the sentences that the report repeats."""
+    return f"notes = {json.dumps(list(notes), ensure_ascii=False)}\n"
+
+
+def views_parts(views: Descriptors | Lists) -> dict[str, np.ndarray | Lists]:
+    """Return where descriptors or lists lie in a data folder."""
+    if isinstance(views, Lists):
+        return {"query/retrievals.npz": views}
+    return {"map/descriptors.npy": views.map_rows, "query/descriptors.npy": views.query_rows}
+
+
+def write_parts(
+    out: Path, texts: Mapping[str, str], arrays: Mapping[str, np.ndarray | Lists]
+) -> None:
+    """Write files of a data folder: all of them or none.
+
+    Args:
+        out: a new folder, or one that lacks these files; its about.toml alone is replaced.
+        texts: name below `out` -> text.
+        arrays: name below `out` -> descriptors or lists.
+
+    Raises:
+        InputError: a file is there already, or nothing can be written.
+    """
+    names = [*texts, *arrays]
+    for name in names:
+        if name != "about.toml" and (out / name).exists():
+            fix = "it is never overwritten: move it away, or choose a new folder"
+            raise InputError(f"{out / name}: is there already; {fix}")
     try:
         with locked_part(out, is_folder=True) as part:
-            for name in ("map", "query", *(("truth",) if truth is not None else ())):
-                (part / name).mkdir()
-            # The truth of a drive that is its own map lies in a frame of its own.
-            origin, moved = _origin(mapped.xyt, truth if own_gap_m is None else None)
-            files = {
-                "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
-                "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
-                "about.toml": f"notes = {json.dumps([*notes, *moved], ensure_ascii=False)}\n"
-                + ("" if own_gap_m is None else f"own_gap_m = {own_gap_m}\n"),
-            }
-            if truth is not None:
-                files["truth/query_poses.csv"] = stamped_text(
-                    "query_poses", POSE, query[0], truth - origin
-                )
-            for name, text in files.items():
+            for name in names:
+                (part / name).parent.mkdir(exist_ok=True)
+            for name, text in texts.items():
                 (part / name).write_text(text, encoding="utf-8")
-            _write_views(views, part)
-            part.rename(out)
+            for name, held in arrays.items():
+                if isinstance(held, Lists):
+                    np.savez(part / name, index=held.index, similarity=held.similarity)
+                else:
+                    _copy_rows(held, part / name)
+            if out.exists():
+                _move_in(part, out, names)
+            else:
+                part.rename(out)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); choose another folder"
         ) from error
 
 
-def _write_views(views: Descriptors | Lists, folder: Path) -> None:
-    if isinstance(views, Lists):
-        path = folder / "query/retrievals.npz"
-        np.savez(path, index=views.index, similarity=views.similarity)
-        return
-    _copy_rows(views.map_rows, folder / "map/descriptors.npy")
-    _copy_rows(views.query_rows, folder / "query/descriptors.npy")
+def _move_in(part: Path, out: Path, names: Sequence[str]) -> None:
+    """Move finished files into a folder, and out again where one of them does not fit."""
+    moved: list[Path] = []
+    try:
+        # What the folder says of itself comes last.
+        for name in sorted(names, key=lambda name: name == "about.toml"):
+            (out / name).parent.mkdir(exist_ok=True)
+            (part / name).replace(out / name)
+            moved.append(out / name)
+    except OSError:
+        for path in moved:
+            path.unlink(missing_ok=True)
+        raise
 
 
 def stamped_text(spec: str, names: Sequence[str], t_s: np.ndarray, rows: np.ndarray) -> str:
@@ -148,6 +206,19 @@ def _origin(
     x, y = mapped[0, :2]
     said = f"local origin: x = {x:.6f} m and y = {y:.6f} m were subtracted from all positions"
     return np.array([[x, y, 0.0]]), (said,)
+
+
+def map_parts(mapped: Trajectory) -> tuple[str, tuple[str, ...]]:
+    """Return map/poses.csv and what must be said of its origin."""
+    origin, said = _origin(mapped.xyt, None)
+    return stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin), said
+
+
+def origin_of(notes: Sequence[str]) -> Float[np.ndarray, "1 3"]:
+    """Return the local origin that a data folder's notes name; zeros where they name none."""
+    found = [match for note in notes if (match := ORIGIN.search(note))]
+    x, y = (float(found[0][1]), float(found[0][2])) if found else (0.0, 0.0)
+    return np.array([[x, y, 0.0]])
 
 
 def _copy_rows(rows: np.ndarray, path: Path) -> None:

@@ -34,8 +34,11 @@ class Features:
         self._path, self._file = path, file
         self._groups = _groups(path, file, frames)
         first = self._dataset(0)
-        self.dimension = int(first.shape[0])
+        self._shape = first.shape
+        self.dimension = int(np.prod(first.shape))
         self.dtype = np.dtype(first.dtype)
+        squeezed = f"{path.name}: shape {first.shape} is read as ({self.dimension},)"
+        self.notes = () if len(first.shape) == 1 else (squeezed,)
 
     def _dataset(self, row: int) -> Any:
         # The low level is four times as fast, which counts for a hundred thousand images.
@@ -46,7 +49,9 @@ class Features:
             what = f"group {group} lacks {DATASET}"
             raise fail(self._path, what, "extract it again with hloc") from error
         spec = load_spec("hloc")["dataset"]
-        if found.rank != spec["ndim"] or found.dtype.kind not in spec["kinds"]:
+        # One row or column of numbers is a descriptor too.
+        n_long = sum(n != 1 for n in found.shape)
+        if found.rank < 1 or n_long > spec["ndim"] or found.dtype.kind not in spec["kinds"]:
             what = f"{group}/{DATASET} has shape {found.shape} and dtype {found.dtype}"
             raise fail(self._path, what, f"expected {spec['shape']}")
         return found
@@ -60,13 +65,13 @@ class Features:
         block = np.empty((len(rows), self.dimension), self.dtype)
         for at, row in enumerate(rows):
             found = self._dataset(int(row))
-            if found.shape != (self.dimension,) or found.dtype != self.dtype:
+            if found.shape != self._shape or found.dtype != self.dtype:
                 what = (
-                    f"{self._groups[int(row)]} has {found.shape[0]} numbers of {found.dtype}, but"
-                    f" {self._groups[0]} has {self.dimension} of {self.dtype}"
+                    f"{self._groups[int(row)]} has {np.prod(found.shape)} numbers of {found.dtype},"
+                    f" but {self._groups[0]} has {self.dimension} of {self.dtype}"
                 )
                 raise fail(self._path, what, "use one network for all images")
-            found.read(h5py.h5s.ALL, h5py.h5s.ALL, block[at])
+            found.read(h5py.h5s.ALL, h5py.h5s.ALL, block[at].reshape(self._shape))
         return block
 
 

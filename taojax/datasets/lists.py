@@ -13,7 +13,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.datasets.arrays import blocks, check_begin, check_kind, map_archive, map_npy
+from taojax.datasets.arrays import (
+    blocks,
+    check_begin,
+    check_kind,
+    map_archive,
+    map_npy,
+    two_axes,
+)  # fmt: skip
 from taojax.datasets.folder import Lists, Session
 from taojax.datasets.frame_names import Names
 from taojax.specs import fail, read_text
@@ -177,7 +184,7 @@ def _from_matrix(
     kept: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " t"]],
 ) -> Lists:
     """Keep the best candidates of every row of a dense matrix, block by block."""
-    matrix = map_npy(path, "similarity")
+    matrix, said = two_axes(path, map_npy(path, "similarity"), (), "(T, M) float32")
     whole = (len(sessions[1].frames), len(sessions[0].frames))
     if matrix.shape == whole:
         columns, rows = kept
@@ -204,7 +211,7 @@ def _from_matrix(
         index[done : done + len(some)] = np.take_along_axis(best, order, axis=1)
         similarity[done : done + len(some)] = np.take_along_axis(values, order, axis=1)
         done += len(some)
-    return Lists(index, np.minimum(similarity, 1.0))
+    return Lists(index, np.minimum(similarity, 1.0), said)
 
 
 def _check_matrix(path: Path, part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> None:

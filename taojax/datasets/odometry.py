@@ -4,28 +4,31 @@ Every source becomes a drive in its own frame; the motion between two frames is 
 at their stamps. So sources of any rate fit frames of any rate.
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from taojax.datasets.clocks import in_order, seconds
+from taojax.datasets.named_columns import values_of
+from taojax.datasets.reading import PLAIN, Drive, Reading
 from taojax.datasets.rosbag import read_bag
 from taojax.datasets.simulate import simulated_odometry
+from taojax.datasets.text_rows import read_rows
 from taojax.datasets.trajectories import (
-    Plane,
-    check_seconds,
+    NUMBERED,
     read_trajectory,
     row_of,
     stamps_s,
+    text_columns,
 )
 from taojax.datasets.trajectory import Trajectory, integrate, motions, pose_at
 from taojax.datasets.wheels import read_wheels
 from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError
 from taojax.specs import fail
-from taojax.tables import read_table
+from taojax.tables import MOTION, read_table
 
 __all__ = ["OdometryKind", "odometry_at", "read_odometry", "simulated"]
 
@@ -38,50 +41,41 @@ LEAST_COVERED = 0.5
 """Odometry that covers a smaller share of the frames belongs to another drive."""
 
 
-def read_odometry(
-    path: Path,
-    kind: OdometryKind,
-    *,
-    times: Path | None = None,
-    plane: Plane | None = None,
-    topic: str | None = None,
-) -> Trajectory:
+def read_odometry(path: Path, kind: OdometryKind, reading: Reading = PLAIN) -> Drive:
     """Read odometry as a drive in its own frame.
 
     Args:
         path: a file; a sequence folder for `wheels`; a file or folder for `bag`.
         kind: a file of poses (see `read_trajectory`), `steps` (the contract's
-            query/odometry.csv), `wheels` (Complex Urban counters and gyro), `bag` (ROS 1 or 2)
-            or `robotcar-vo` (vo/vo.csv).
-        times: stamp of every KITTI frame [s].
-        plane: how 3-D poses are laid flat; without it `xz` for KITTI and `xy` for the others.
-            Kinds that are planar by themselves do not ask it.
-        topic: of a bag that has several with poses.
+            query/odometry.csv, or columns dx,dy,dtheta), `wheels` (Complex Urban counters and
+            gyro), `bag` (ROS 1 or 2) or `robotcar-vo` (vo/vo.csv).
+        reading: what the user says of it; kinds that are planar by themselves do not ask the plane.
 
     Returns:
-        At least two stamped poses.
+        At least two poses.
 
     Raises:
         InputError: naming file, row and fix.
         MissingExtraError: a bag, and rosbags is not installed.
     """
-    if times is not None and kind != "kitti":
-        raise fail(times, f"odometry of kind {kind} has its own stamps", "leave the times away")
-    if topic is not None and kind != "bag":
+    if reading.times is not None and kind in ("steps", "wheels", "bag", "robotcar-vo"):
+        what = f"odometry of kind {kind} has its own stamps"
+        raise fail(reading.times, what, "leave the times away")
+    if reading.topic is not None and kind != "bag":
         raise fail(path, f"odometry of kind {kind} has no topics", "leave the topic away")
     if kind == "steps":
-        return _read_steps(path)
+        return _read_steps(path, reading)
     if kind == "wheels":
-        return read_wheels(path)
+        return Drive(read_wheels(path))
     if kind == "bag":
-        return read_bag(path, topic=topic, plane=plane or "xy")
+        return read_bag(path, topic=reading.topic, plane=reading.plane or "xy")
     if kind == "robotcar-vo":
-        return _read_robotcar_vo(path)
-    return read_trajectory(path, kind, times=times, plane=plane)
+        return Drive(_read_robotcar_vo(path))
+    return read_trajectory(path, kind, reading)
 
 
 def odometry_at(
-    source: Trajectory, t_s: Float[np.ndarray, " t"], gate_s: float
+    source: Trajectory, t_s: Float[np.ndarray, " t"], gate_s: float, name: str = "odometry"
 ) -> tuple[Float[np.ndarray, "t 3"], str | None]:
     """Read the motion between frames off a drive.
 
@@ -89,6 +83,7 @@ def odometry_at(
         source: the drive, in any frame.
         t_s: (T,) stamps of the frames on the same clock, rising.
         gate_s: a frame farther than this from every pose of the drive is not covered by it.
+        name: where the drive comes from, for messages.
 
     Returns:
         (T, 3) forward [m], left [m], yaw [rad] since the frame before, row 0 zero; and a sentence
@@ -103,9 +98,9 @@ def odometry_at(
     share, n_out = float(is_covered.mean()), int((~is_covered).sum())
     if share < LEAST_COVERED:
         raise InputError(
-            f"odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: frames run "
-            f"from {t_s[0]:.3f} to {t_s[-1]:.3f} s, odometry from {source.t_s[0]:.3f} to "
-            f"{source.t_s[-1]:.3f} s; {_clock_fix(source.t_s, t_s)}"
+            f"{name}: odometry covers {share:.0%} of the {len(t_s)} frames within {gate_s:g} s: "
+            f"frames run from {t_s[0]:.3f} to {t_s[-1]:.3f} s, odometry from "
+            f"{source.t_s[0]:.3f} to {source.t_s[-1]:.3f} s; {_clock_fix(source.t_s, t_s)}"
         )
     note = None
     if n_out:
@@ -153,17 +148,41 @@ def _clock_fix(source_s: np.ndarray, t_s: np.ndarray) -> str:
     power = powers.pop() if len(powers) == 1 else 0
     if power:
         larger = "odometry" if power > 0 else "frames"
-        return f"the stamps of the {larger} look 1e{3 * abs(power)} times too large: use seconds"
+        large = f"the stamps of the {larger} look 1e{3 * abs(power)} times too large: use seconds"
+        return f"{large}, or add --time-unit"
     if source_s[0] <= t_s[-1] and t_s[0] <= source_s[-1]:
         return "use denser odometry, a wider gate, or odometry of the whole drive"
-    return "give both the same clock, and odometry of the same drive"
+    guess = f"add --clock-offset {t_s[0] - source_s[0]:.6f} if both start together"
+    return f"give both the same clock, and odometry of the same drive; {guess}"
 
 
-def _read_steps(path: Path) -> Trajectory:
-    table = read_table(path, "odometry_steps")
-    t_s, *steps = table.values()
-    check_seconds(path, t_s, partial(row_of, path, len(t_s)))
-    return Trajectory(t_s, integrate(np.stack(steps, axis=1)))
+def _read_steps(path: Path, reading: Reading) -> Drive:
+    """Chain motions, after late rows are put in their place and repeated ones left out."""
+    table = read_rows(path, reading.decimal)
+    found = text_columns(path, table, "steps", reading)
+    if missing := [name for name in MOTION if name not in found.columns]:
+        what = f"row {table.lines[0]}: no column {missing[0]}"
+        raise fail(path, what, "steps are dx,dy,dtheta; poses need --odometry-kind poses")
+    notes = [*table.notes, *([f"{path.name}: {found.said}"] if found.said else [])]
+    moved, unit = [], None
+    for role in MOTION:
+        values, unit = values_of(path, table, role, found.columns[role])
+        moved.append(values)
+    steps, n = np.stack(moved, axis=1), len(table.lines)
+    if n < 2:
+        raise fail(path, f"{n} data row(s)", "at least 2 are needed")
+    if unit == "deg":
+        notes.append(f"{path.name}: column {found.columns[MOTION[2]][0].name} is in degrees")
+    if "t_s" not in found.columns:
+        drive = Trajectory(np.arange(float(n)), integrate(steps))
+        return Drive(drive, (*notes, NUMBERED), False)
+    raw, unit = values_of(path, table, "t_s", found.columns["t_s"])
+    where = lambda index: f"row {table.lines[index]}"
+    step_m = np.hypot(*steps[1:, :2].T)
+    t_s, assumed = seconds(path, raw, step_m, unit or found.unit, reading.time_unit, where)
+    order = in_order(path, t_s, steps, where, is_motion=True)
+    drive = Trajectory(t_s[order.rows], integrate(steps[order.rows]))
+    return Drive(drive, (*notes, *assumed, *order.notes), True, order.rows, n)
 
 
 def _read_robotcar_vo(path: Path) -> Trajectory:

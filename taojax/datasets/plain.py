@@ -20,13 +20,13 @@ from jaxtyping import Float
 
 from taojax.datasets.files import DERIVED, NUMBERED, read_poses
 from taojax.datasets.folder import Session
-from taojax.datasets.trajectories import Plane
+from taojax.datasets.reading import PLAIN, Drive, Reading
 from taojax.datasets.trajectory import Trajectory, headings
 from taojax.errors import InputError
 from taojax.specs import fail, load_spec, read_bytes
 from taojax.tables import read_table
 
-__all__ = ["found_in", "read_files", "read_plain", "read_traverse"]
+__all__ = ["found_in", "read_files", "read_plain", "read_session", "read_traverse", "session_of"]
 
 SIDES = ("database", "queries")
 IMAGES = (".jpg", ".jpeg", ".png")
@@ -43,14 +43,14 @@ N_LISTED = 6
 
 
 def read_files(
-    map_poses: Path, query_poses: Path | None, plane: Plane | None = None
+    map_poses: Path, query_poses: Path | None, reading: Reading = PLAIN
 ) -> tuple[Session, Session | None]:
     """Read map and query sessions from one file of poses each.
 
     Args:
         map_poses: any file that `read_poses` takes.
         query_poses: the same; None where nobody knows the true poses.
-        plane: how 3-D poses are laid flat.
+        reading: what the user says of them.
 
     Returns:
         Map and query; None for a query that only its odometry knows.
@@ -58,8 +58,8 @@ def read_files(
     Raises:
         InputError: a file is malformed.
     """
-    query = None if query_poses is None else _posed(query_poses, query_poses.parent, plane)
-    return _posed(map_poses, map_poses.parent, plane), query
+    query = None if query_poses is None else read_session(query_poses, query_poses.parent, reading)
+    return read_session(map_poses, map_poses.parent, reading), query
 
 
 def read_plain(folder: Path) -> tuple[Session, Session | None]:
@@ -129,15 +129,15 @@ def read_traverse(folder: Path) -> Session:
     if folder.is_dir() and not path.exists():
         what = f"holds no poses.csv, but {found_in(folder)}"
         raise fail(folder, what, OTHER_NAMES)
-    return _posed(path, folder)
+    return read_session(path, folder)
 
 
 def _contract(folder: Path) -> tuple[Session, Session | None]:
     places = [folder / "truth/query_poses.csv", folder / "query/poses.csv"]
     there = [path for path in places if path.exists()]
-    mapped = _posed(folder / "map/poses.csv", folder / "map")
+    mapped = read_session(folder / "map/poses.csv", folder / "map")
     if len(there) == 1:
-        return mapped, _posed(there[0], folder / "query")
+        return mapped, read_session(there[0], folder / "query")
     if there:
         what = "holds both truth/query_poses.csv and query/poses.csv"
         raise fail(folder, what, "keep one, with the poses of the queries")
@@ -150,14 +150,37 @@ def _contract(folder: Path) -> tuple[Session, Session | None]:
     return mapped, None
 
 
-def _posed(path: Path, side: Path, plane: Plane | None = None) -> Session:
-    """Read poses; the frames are the files in images/ where those are as many."""
-    drive = read_poses(path, plane)
-    n = len(drive.poses.t_s)
-    images = _images(side / "images")
-    if len(images) != n:
-        images = [f"{row:06d}" for row in range(n)]
-    return Session(tuple(images), drive.poses, notes=drive.notes)
+def read_session(path: Path, side: Path, reading: Reading = PLAIN) -> Session:
+    """Read poses; the frames are the files in images/ where those are as many.
+
+    Args:
+        path: any file that `read_poses` takes.
+        side: folder that may hold images/.
+        reading: what the user says of the file.
+
+    Returns:
+        Frames in the order of time; where rows came late or twice, all rows of the file are listed.
+
+    Raises:
+        InputError: the file is malformed.
+    """
+    return session_of(read_poses(path, reading), _images(side / "images"))
+
+
+def session_of(drive: Drive, images: Sequence[str] = (), *, has_pose: bool = True) -> Session:
+    """Make a drive's poses frames, named by images where those are as many as rows.
+
+    Args:
+        drive: the poses.
+        images: names, in the order of the rows.
+        has_pose: False where the poses are what odometry believes.
+    """
+    n = drive.n_rows or len(drive.poses.t_s)
+    names = tuple(images) if len(images) == n else tuple(f"{row:06d}" for row in range(n))
+    rows = range(n) if drive.rows is None else drive.rows
+    frames = tuple(names[int(row)] for row in rows)
+    listed = names if frames != names else ()
+    return Session(frames, drive.poses, has_pose, drive.notes, listed)
 
 
 def _images(folder: Path) -> list[str]:

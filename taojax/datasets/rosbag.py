@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from taojax.datasets.trajectories import LARGEST, Plane, flat_poses, rotations
+from taojax.datasets.clocks import in_order
+from taojax.datasets.reading import Drive, Plane
+from taojax.datasets.trajectories import LARGEST, flat_poses, rotations
 from taojax.datasets.trajectory import Trajectory
 from taojax.errors import InputError, MissingExtraError
 from taojax.specs import fail
@@ -23,7 +25,7 @@ TYPES = (
 _Row = tuple[int, tuple[str, str], list[float]]
 
 
-def read_bag(path: Path, *, topic: str | None = None, plane: Plane = "xy") -> Trajectory:
+def read_bag(path: Path, *, topic: str | None = None, plane: Plane = "xy") -> Drive:
     """Read the poses of one topic.
 
     Args:
@@ -32,11 +34,13 @@ def read_bag(path: Path, *, topic: str | None = None, plane: Plane = "xy") -> Tr
         plane: how they are laid flat (see `trajectories`); ROS frames are z-up: `xy`.
 
     Returns:
-        At least two poses; stamps are those of the messages' headers, not of the recorder.
+        At least two poses in the order of their stamps, which are those of the messages' headers,
+        not of the recorder; late and repeated messages are counted.
 
     Raises:
-        InputError: no bag, no such topic or several, frames that change, stamps that do not rise,
-            a pose that is not finite or no pose; it names the message, counted from 1.
+        InputError: no bag, no such topic or several, frames that change, a clock that runs back
+            for long, one stamp with two poses, a pose that is not finite or no pose; it names the
+            message, counted from 1.
         MissingExtraError: rosbags is not installed.
     """
     rows, topic = _read_rows(path, topic)
@@ -50,15 +54,15 @@ def read_bag(path: Path, *, topic: str | None = None, plane: Plane = "xy") -> Tr
     stamps = np.array([row[0] for row in rows], dtype=np.int64)
     if stamps[0] == 0 and stamps[-1] == 0:
         raise fail(path, f"topic {topic} has no stamps in its headers", "stamp the messages")
-    if (odd := np.flatnonzero(np.diff(stamps) <= 0)).size:
-        what = f"{where(int(odd[0]) + 1)}: its stamp is not later than that of the one before"
-        raise fail(path, what, "record one message per stamp, in order of time")
     values = np.array([row[2] for row in rows], dtype=float)
     if (odd := np.flatnonzero(~(np.abs(values) <= LARGEST).all(axis=1))).size:
         what = f"{where(int(odd[0]))}: a number is not finite or beyond {LARGEST:g}"
         raise fail(path, what, "cut the message out of the bag")
     rotation = rotations(path, values[:, 3:], where)
-    return Trajectory(stamps / 1e9, flat_poses(path, values[:, :3], rotation, plane, where))
+    xyt = flat_poses(path, values[:, :3], rotation, plane, where)
+    order = in_order(path, stamps / 1e9, xyt, where)
+    poses = Trajectory(stamps[order.rows] / 1e9, xyt[order.rows])
+    return Drive(poses, order.notes, True, order.rows, len(rows))
 
 
 def _read_rows(path: Path, topic: str | None) -> tuple[list[_Row], str]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from taojax.datasets.convert import Choices, Motion
     from taojax.datasets.files import MotionKind
     from taojax.datasets.folder import Session
+    from taojax.datasets.reading import Reading
     from taojax.datasets.sessions import Matching
 
     Sessions = tuple[Session, Session | None]
@@ -68,6 +69,9 @@ def make(data: Data) -> None:
     """
     _check_flags(data)
     _check_places(data)
+    if isinstance(data, Files) and (data.map_poses is None or _is_map_alone(data)):
+        _add(data)
+        return
     read = partial(_READ[type(data)], data, _matching(data))
     # Whether a plain folder is one is asked before what its frames look like.
     plain = read() if isinstance(data, Folder) else None
@@ -82,11 +86,39 @@ def make(data: Data) -> None:
         say(f"note: {note}")
 
 
+def _add(data: Files) -> None:
+    """Make a folder of a map alone, or add a query or the truth to one that is there."""
+    from taojax.datasets import additions
+    from taojax.datasets.plain import read_session
+
+    reading = _reading(data, is_motion=False)
+    out, truth = data.out, data.query_poses
+    if data.map_poses is not None and data.map_views is not None:
+        mapped = read_session(data.map_poses, data.map_poses.parent, reading)
+        added = additions.make_map(out, mapped, data.map_views)
+    elif truth is not None and (out / "query/odometry.csv").exists() and data.odometry is None:
+        added = additions.add_truth(
+            out, truth, reading, gate_s=data.gate_s, offset_s=data.clock_offset
+        )
+    else:
+        # Odometry over odometry is refused before its views are asked for.
+        query = None if truth is None else read_session(truth, truth.parent, reading)
+        added = additions.add_query(out, query, _choices(data))
+    say(f"added {', '.join(added.names)}")
+    for note in added.notes:
+        say(f"note: {note}")
+
+
+def _is_map_alone(data: Files) -> bool:
+    return data.odometry is None and data.query_poses is None and data.query_views is None
+
+
 def _check_flags(data: Data) -> None:
     """Refuse flags that contradict each other or ask for nothing."""
     if data.simulate_views and (data.map_views or data.query_views):
         raise UsageError("--simulate-views replaces --map-views and --query-views; drop one")
-    if data.query_views is not None and data.map_views is None:
+    may_lack = isinstance(data, Files) and data.map_poses is None
+    if data.query_views is not None and data.map_views is None and not may_lack:
         raise UsageError("--query-views goes with --map-views")
     if data.spacing_m is not None and (data.map_frames or data.query_frames):
         raise UsageError("--spacing-m chooses frames by metres; drop it or the numbers of frames")
@@ -98,7 +130,13 @@ def _check_flags(data: Data) -> None:
         raise UsageError(f"--least-matched {data.least_matched} is a share from 0 to 1")
     if data.seed < 0:
         raise UsageError(f"--seed {data.seed} must not be negative")
-    own = () if isinstance(data, Files) else ("plane",)
+    _check_motion_flags(data)
+
+
+def _check_motion_flags(data: Data) -> None:
+    """Refuse flags of odometry where none is given."""
+    own = ("plane", "time_unit", "quaternion", "angles", "columns", "decimal", "clock_offset")
+    own = () if isinstance(data, Files) else own
     for name in ("odometry_kind", "times", "topic", *own):
         if data.odometry is None and getattr(data, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} goes with --odometry")
@@ -106,8 +144,8 @@ def _check_flags(data: Data) -> None:
 
 def _check_places(data: Data) -> None:
     """Refuse files and folders that are not given or not there, before questions on the rest."""
-    if isinstance(data, Files) and data.odometry is None and data.query_poses is None:
-        raise UsageError("what is known of the query? Give --odometry, --query-poses or both")
+    if isinstance(data, Files):
+        _check_parts(data)
     flags = ("map", "query", "folder", "map_poses", "query_poses", "odometry", "times",
              "map_views", "query_views")  # fmt: skip
     for name in flags:
@@ -120,6 +158,37 @@ def _check_places(data: Data) -> None:
             raise InputError(f"{path}: no such file or folder{label}; point at another one")
 
 
+def _check_parts(data: Files) -> None:
+    """Refuse single files that make no folder together, and none that lies in OUT already."""
+    has_map = (data.out / "map/poses.csv").exists()
+    if data.map_poses is None and not has_map:
+        held = "holds no map/poses.csv" if data.out.exists() else "is not there yet"
+        raise UsageError(f"{data.out} {held}: give --map-poses")
+    if data.map_poses is not None and has_map:
+        fix = "leave --map-poses away to add to this folder, or choose a new one"
+        raise InputError(f"{data.out}: exists already and holds map/poses.csv; {fix}")
+    if _is_map_alone(data) and (data.map_poses is None or data.map_views is None):
+        raise UsageError("what is known of the query? Give --odometry, --query-poses or both")
+
+
+def _reading(data: Data, *, is_motion: bool) -> "Reading":
+    """Return what the user says of files of poses or, with its own flags, of the odometry."""
+    from taojax.datasets.reading import Reading
+
+    columns = tuple(name.strip() for name in (data.columns or "").split(",") if name.strip())
+    return Reading(
+        times=data.times if is_motion else None,
+        topic=data.topic if is_motion else None,
+        plane=data.plane,
+        time_unit=data.time_unit,
+        quaternion=data.quaternion,
+        angles=data.angles,
+        columns=columns,
+        decimal=data.decimal,
+        is_shared=not is_motion,
+    )
+
+
 def _motion(data: Data) -> "Motion | None":
     """Return the odometry that was asked for, else the data set's own, if any."""
     from taojax.datasets.convert import Motion, recorded_odometry
@@ -127,18 +196,21 @@ def _motion(data: Data) -> "Motion | None":
     if data.odometry is None:
         own = {Folder: "folder", Files: None}.get(type(data), "query")
         return None if own is None else recorded_odometry(getattr(data, own))
-    if (kind := data.odometry_kind or _kind_of(data.odometry)) is None:
-        raise UsageError(
+    reading = _reading(data, is_motion=True)
+    if (kind := data.odometry_kind or _kind_of(data.odometry, reading)) is None:
+        refusal = UsageError if data.odometry.suffix.lower() == ".npy" else InputError
+        raise refusal(
             f"{data.odometry} does not say what it holds; add --odometry-kind: steps (motion from"
-            " frame to frame), poses (where odometry believes to be), or the program that wrote it"
+            " frame to frame), poses (where odometry believes to be), or the program that wrote it;"
+            " or --columns with the names of its columns"
         )
-    return Motion(data.odometry, kind, data.times, data.plane, data.topic)
+    return Motion(data.odometry, kind, reading, data.clock_offset)
 
 
-def _kind_of(path: Path) -> "MotionKind | None":
+def _kind_of(path: Path, reading: "Reading") -> "MotionKind | None":
     from taojax.datasets.files import kind_of
 
-    return kind_of(path)
+    return kind_of(path, reading)
 
 
 def _views(data: Data) -> "tuple[Path, Path | None] | None":
@@ -149,6 +221,9 @@ def _views(data: Data) -> "tuple[Path, Path | None] | None":
         return None
     if data.map_views is not None:
         return data.map_views, data.query_views
+    held = data.out / "map/descriptors.npy"
+    if isinstance(data, Files) and data.query_views is not None and held.is_file():
+        return held, data.query_views
     own = recorded_views(data.folder, data.map) if isinstance(data, Folder) else None
     if own is None:
         looked = ""
@@ -178,6 +253,7 @@ def _choices(data: Data) -> "Choices":
         gate_s=data.gate_s,
         motion=_motion(data),
         views=views,
+        views_order=data.views_order,
         seed=data.seed,
     )
 
@@ -259,7 +335,9 @@ def _folder(data: Folder, matching: "Matching") -> "Sessions":
 def _files(data: Files, matching: "Matching") -> "Sessions":
     from taojax.datasets.plain import read_files
 
-    return read_files(data.map_poses, data.query_poses, data.plane)
+    if data.map_poses is None:
+        raise UsageError("give --map-poses")
+    return read_files(data.map_poses, data.query_poses, _reading(data, is_motion=False))
 
 
 _READ: dict[type, Callable[[Any, "Matching"], "Sessions"]] = {

@@ -13,6 +13,11 @@ Kind = Literal[
 ]
 
 
+def _alias(metavar: str, default: str, name: str) -> Any:
+    hint = f"(default: {default})"
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, aliases=(name,))
+
+
 def _place(metavar: str) -> Any:
     return tyro.conf.arg(metavar=metavar)
 
@@ -48,10 +53,35 @@ class Making:
     (forward, left, yaw since the row before) or poses (x, y, theta), with or without stamps."""
 
     times: Annotated[Path | None, flag("FILE", "none")] = None
-    """Stamps of odometry without any (kitti)."""
+    """Stamps of odometry without any (kitti, g2o, arrays)."""
 
-    plane: Annotated[Literal["xz", "xy"] | None, flag("xz|xy", "as the kind has it")] = None
-    """Axes of the ground in 3-D poses: xz for cameras, xy where z is up."""
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, flag("UNIT", "recognised")] = None
+    """Unit of stamps, in every file that they can be of this unit in."""
+
+    clock_offset: Annotated[float | None, flag("S", "found where counts and steps agree")] = None
+    """Seconds to add to the stamps of the odometry."""
+
+    quaternion: Annotated[
+        Literal["xyzw", "wxyz"] | None, flag("xyzw|wxyz", "as the kind has it")
+    ] = None
+    """Order of quaternions, in every file whose direction of motion does not exclude it."""
+
+    angles: Annotated[Literal["rad", "deg", "compass"] | None, flag("UNIT", "as names say")] = None
+    """Headings: rad or deg counter-clockwise from x; compass: degrees clockwise from y, north."""
+
+    columns: Annotated[str | None, flag("NAMES", "as the header says")] = None
+    """Names of the columns of text without a header, such as t,x,y,theta; - is not used."""
+
+    decimal: Annotated[Literal["point", "comma"] | None, flag("point|comma", "recognised")] = None
+    """Decimal sign of text."""
+
+    views_order: Annotated[Literal["rows", "time"] | None, flag("rows|time", "asked")] = None
+    """What descriptors follow where rows of poses came late: the rows of that file, or time."""
+
+    plane: Annotated[Literal["xz", "xy", "xz-up"] | None, flag("PLANE", "as the kind has it")] = (
+        None
+    )
+    """Axes of the ground in 3-D poses: xz for cameras (y down; xz-up: y up), xy where z is up."""
 
     topic: Annotated[str | None, flag("NAME", "the only one")] = None
     """Odometry topic of a bag."""
@@ -189,14 +219,17 @@ class Files(Making):
     """
 
     out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
-    """Data folder to make."""
+    """Data folder to make; or one with a map, to which query or truth are added."""
 
-    map_poses: Annotated[Path, _place("FILE")]
-    """Poses of the map images: an .npy of (M, 3) x, y, theta or (M, 4) with the stamp first, a csv
-    t_s,x_m,y_m,theta_rad, or what another program wrote."""
+    map_poses: Annotated[Path | None, flag("FILE", "those in OUT")] = None
+    """Poses of the map images: an .npy of (M, 3) x, y, theta or (M, 4) with the stamp first, a
+    table with names such as t,x,y,theta, or what another program wrote."""
 
-    query_poses: Annotated[Path | None, flag("FILE", "nobody knows them: no audit")] = None
-    """True poses of the query images, one each, in the same kinds of files."""
+    query_poses: Annotated[
+        Path | None, _alias("FILE", "nobody knows them: no audit", "--truth-poses")
+    ] = None
+    """True poses of the query images, one each, in the same kinds of files; where OUT holds a query
+    already, any that cover its time."""
 
 
 @dataclasses.dataclass(frozen=True)
