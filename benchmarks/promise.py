@@ -52,7 +52,7 @@ RATES = 0.5, 1.0, 2.0, 4.0
 
 DRAWN = {
     "off_share": "share of the test half off the map",
-    "alias": "share of appearance that many places have in common",
+    "alias": "share of appearance in common",
     "drift": "odometry scale error",
     "rate": "query frames per map frame",
     "noise": "noise of the query views",
@@ -171,6 +171,12 @@ def pooled_share(rows: Sequence[dict[str, Any]]) -> tuple[float, float, float]:
     return share, float(low), float(high)
 
 
+def _chosen(
+    rows: Sequence[dict[str, Any]], kind: str, use: str, most: float
+) -> list[dict[str, Any]]:
+    return [r for r in rows if (r["verdict"], r["numbers"], r["max_wrong"]) == (kind, use, most)]
+
+
 def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Say for every kind of verdict, numbers and share asked for what became of the promise.
 
@@ -182,7 +188,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     keys = dict.fromkeys((row["verdict"], row["numbers"], row["max_wrong"]) for row in rows)
     for kind, use, most in keys:
-        own = [r for r in rows if (r["verdict"], r["numbers"], r["max_wrong"]) == (kind, use, most)]
+        own = _chosen(rows, kind, use, most)
         share, low, high = pooled_share(own)
         recalls = [r["right"] / r["right_total"] for r in own if r["right_total"] >= LEAST_RIGHT]
         big = [r for r in own if r["right"] + r["wrong"] >= LEAST_ACCEPTED]
@@ -198,20 +204,14 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _chosen(
-    rows: Sequence[dict[str, Any]], kind: str, use: str, most: float
-) -> list[dict[str, Any]]:
-    return [r for r in rows if (r["verdict"], r["numbers"], r["max_wrong"]) == (kind, use, most)]
-
-
 def draw(rows: Sequence[dict[str, Any]]) -> Figure:
     """Draw the realised wrong share against the promised one, and at 5 % by what was drawn."""
     figure = Figure(figsize=(11, 6.4), layout="constrained")
-    axes = figure.subplots(2, 3).ravel()
+    axes, said = figure.subplots(2, 3).ravel(), summary(rows)
     kinds = [(kind, use) for kind in ("final", "now") for use in ("shipped", "refined")]
     for number, (kind, use) in enumerate(kinds):
         style = {"color": CYCLE[number], "linestyle": STYLES[number], "marker": "o", "ms": 4}
-        table = summary(_chosen_all(rows, kind, use))
+        table = [row for row in said if (row["verdict"], row["numbers"]) == (kind, use)]
         at = np.array([row["max_wrong"] for row in table])
         share = np.array([row["wrong_share"] for row in table])
         spread = np.abs(np.array([[r["wrong_lo"], r["wrong_hi"]] for r in table]).T - share)
@@ -237,10 +237,6 @@ def draw(rows: Sequence[dict[str, Any]]) -> Figure:
         ax.grid(alpha=0.25)
         ax.set_ylim(bottom=0)
     return figure
-
-
-def _chosen_all(rows: Sequence[dict[str, Any]], kind: str, use: str) -> list[dict[str, Any]]:
-    return [row for row in rows if (row["verdict"], row["numbers"]) == (kind, use)]
 
 
 def _write(path: Path, rows: Sequence[dict[str, Any]]) -> None:

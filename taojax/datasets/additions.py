@@ -112,7 +112,8 @@ def add_truth(
     """
     _check_new(out, TRUTH)
     t_s = read_table(out / QUERY, "query_odometry")["t_s"]
-    notes = read_about(out).notes
+    about = read_about(out)
+    notes = about.notes
     frames = tuple(f"{row:06d}" for row in range(len(t_s)))
     own = (NUMBERED,) if np.array_equal(t_s, np.arange(len(t_s))) else ()
     session = Session(frames, Trajectory(t_s, np.zeros((len(t_s), 3))), False, own)
@@ -135,7 +136,7 @@ def add_truth(
     more = tuple(f"truth: {note}" for note in (*told, *said))
     texts = {
         TRUTH: stamped_text("query_poses", POSE, t_s, xyt),
-        "about.toml": about_text(dict.fromkeys([*notes, *more])),
+        "about.toml": about_text(dict.fromkeys([*notes, *more]), about.own_gap_m),
     }
     return _write(out, texts, {}, more)
 

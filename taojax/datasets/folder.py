@@ -106,11 +106,10 @@ def write_folder(  # noqa: PLR0913 - what a folder holds
         raise InputError(f"{out}: exists already; choose a new folder")
     # The truth of a drive that is its own map lies in a frame of its own.
     origin, moved = _origin(mapped.xyt, truth if own_gap_m is None else None)
-    own_gap = "" if own_gap_m is None else f"own_gap_m = {own_gap_m}\n"
     texts = {
         "map/poses.csv": stamped_text("map_poses", POSE, mapped.t_s, mapped.xyt - origin),
         "query/odometry.csv": stamped_text("query_odometry", MOTION, *query),
-        "about.toml": about_text([*notes, *moved]) + own_gap,
+        "about.toml": about_text([*notes, *moved], own_gap_m),
     }
     if truth is not None:
         rows = truth - origin
@@ -118,9 +117,15 @@ def write_folder(  # noqa: PLR0913 - what a folder holds
     write_parts(out, texts, views_parts(views))
 
 
-def about_text(notes: Iterable[str]) -> str:
-    """Return about.toml with the sentences that the report repeats."""
-    return f"notes = {json.dumps(list(notes), ensure_ascii=False)}\n"
+def about_text(notes: Iterable[str], own_gap_m: float | None = None) -> str:
+    """Return about.toml with the sentences that the report repeats.
+
+    Args:
+        notes: the sentences.
+        own_gap_m: of a drive that is its own map, metres; None = the map is another drive.
+    """
+    own_gap = "" if own_gap_m is None else f"own_gap_m = {own_gap_m}\n"
+    return f"notes = {json.dumps(list(notes), ensure_ascii=False)}\n{own_gap}"
 
 
 def views_parts(views: Descriptors | Lists) -> dict[str, np.ndarray | Lists]:
