@@ -42,8 +42,10 @@ def cost(p, q, s=None, has=None, weight=None, settings=None):
     s = np.full(n, 0.8) if s is None else s
     has = np.ones(n, bool) if has is None else has
     weight = np.full(n, 1.0 / n) if weight is None else weight
-    branch = Branch(jnp.asarray(q), jnp.asarray(s, dtype=q.dtype), jnp.asarray(has))
-    return one(settings or params(), jnp.asarray(p), branch, jnp.asarray(weight, dtype=q.dtype))
+    branch = Branch(jnp.asarray(q), jnp.asarray(np.asarray(s, q.dtype)), jnp.asarray(has))
+    return one(
+        settings or params(), jnp.asarray(p), branch, jnp.asarray(np.asarray(weight, q.dtype))
+    )
 
 
 KINDS = {
