@@ -122,7 +122,7 @@ def _read_drive(kind: str, folder: Path, out: Path) -> list[np.ndarray]:
         kind, f"drive.{kind}"
     )
     times = folder / "times.txt" if kind == "kitti" else None
-    drive = read_odometry(folder / name, kind, Reading(times=times))  # type: ignore[arg-type]
+    drive = read_odometry(folder / name, kind, Reading(times=times)).poses  # type: ignore[arg-type]
     motion, _ = odometry_at(drive, drive.t_s, 0.5)
     return [drive.t_s, drive.xyt, motion]
 
