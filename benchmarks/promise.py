@@ -8,7 +8,6 @@ Everything here is simulated; the shipped numbers have seen twenty-three worlds 
 with other seeds.
 """
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,9 @@ from benchmarks.verdict import (
     answered,
     half_numbers,
     halves,
+    write_rows,
 )
+from taojax.audit.labels import nearest_map_distance
 from taojax.config import VerdictConfig
 from taojax.datasets.simulate import WorldConfig, make_world
 from taojax.plots import CYCLE, PALE, STYLES
@@ -139,11 +140,8 @@ def rows_of(seed: int, config: VerdictConfig) -> list[dict[str, Any]]:
     made, drawn = recording(seed)
     one, rows = answered(made, config), []
     _, second = halves(one)
-    off = np.min(
-        np.hypot(*(made.truth_m[second, None] - made.map_poses[None, :, :2]).transpose(2, 0, 1)),
-        axis=1,
-    ) > RADIUS_M  # fmt: skip
-    drawn["off_share"] = float(off.mean())
+    nearest_m = nearest_map_distance(made.truth_m[second], made.map_poses[:, :2])
+    drawn["off_share"] = float(np.mean(nearest_m > RADIUS_M))
     for kind in ("final", "now"):
         own, columns = getattr(one.answers, kind), getattr(one, kind)
         for use in ("shipped", "refined"):
@@ -239,13 +237,6 @@ def draw(rows: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def run(out: Path, *, quick: bool) -> None:
     """Simulate, judge, write both tables and the figure.
 
@@ -257,9 +248,9 @@ def run(out: Path, *, quick: bool) -> None:
     seeds = tqdm(range(FIRST_SEED, FIRST_SEED + n), unit="recording")
     rows = [row for seed in seeds for row in rows_of(seed, config)]
     out.mkdir(parents=True, exist_ok=True)
-    _write(out / "recordings.csv", rows)
+    write_rows(out / "recordings.csv", rows)
     table = summary(rows)
-    _write(out / "promise.csv", table)
+    write_rows(out / "promise.csv", table)
     save(draw(rows), out / "promise")
     for row in table:
         print(

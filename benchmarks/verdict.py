@@ -231,6 +231,14 @@ def default_calibration(recordings: Sequence[Judged], rows: Sequence[Mapping[str
     return numbers.to_toml(Calibration(**found))
 
 
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as CSV under the names of the first one; what a row lacks stays blank."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def run(out: Path, data: Path, *, only: str, write: bool) -> None:
     """Answer all recordings, leave families out in turn, write tables and perhaps the numbers.
 
@@ -247,10 +255,7 @@ def run(out: Path, data: Path, *, only: str, write: bool) -> None:
             jax.clear_caches()  # thousands of compiled shapes exhaust a process's memory maps
     rows = left_out(judged)
     out.mkdir(parents=True, exist_ok=True)
-    with open(out / "verdict.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(out / "verdict.csv", rows)
     settings = ", ".join(
         f"{f.name} {getattr(config, f.name):g}" for f in dataclasses.fields(config)
     )

@@ -112,13 +112,14 @@ def _is_header(cells: list[str], layouts: Sequence[Sequence[Mapping[str, Any]]])
     """Tell names from numbers: a header has no number in any column that holds numbers."""
     layout = next((own for own in layouts if len(own) == len(cells)), ())
     return bool(layout) and not any(
-        _is_number(cell)
+        is_number(cell)
         for cell, column in zip(cells, layout, strict=True)
         if column.get("type") != "text"
     )
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Tell whether a cell is a number."""
     try:
         float(text)
     except ValueError:

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taojax.datasets.text_rows import TextRows, is_number
+from taojax.datasets.text_rows import TextRows
 from taojax.errors import InputError
 from taojax.specs import fail, load_spec
+from taojax.tables import is_number
 
 __all__ = ["COMPASS", "Column", "find_columns", "values_of"]
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from taojax.specs import fail, read_text
+from taojax.tables import is_number
 
-__all__ = ["NAMES", "TextRows", "is_number", "read_rows"]
+__all__ = ["NAMES", "TextRows", "read_rows"]
 
 COMMENTS = ("#", "%", "//")
 """How a line begins that is none of the table."""
@@ -79,15 +80,6 @@ def read_rows(path: Path, decimal: str | None = None) -> TextRows:
         columns = [[cell.replace(",", ".") for cell in column] for column in columns]
     at = [line for line, _ in rows[: len(cells)]]
     return TextRows(columns, at, header, not heads, separator, notes)
-
-
-def is_number(text: str) -> bool:
-    """Tell whether a cell is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _has_number(line: str) -> bool:

@@ -19,10 +19,11 @@ from taojax.datasets.clocks import FASTEST_S, in_order, seconds
 from taojax.datasets.facing import decided, misfit_rad
 from taojax.datasets.named_columns import COMPASS, Column, find_columns, numbers, values_of
 from taojax.datasets.reading import PLAIN, Drive, Plane, Quaternion, Reading
-from taojax.datasets.text_rows import NAMES, TextRows, is_number, read_rows
+from taojax.datasets.text_rows import NAMES, TextRows, read_rows
 from taojax.datasets.trajectory import Trajectory, headings, motions
 from taojax.errors import InputError
 from taojax.specs import fail, load_spec, read_text
+from taojax.tables import is_number
 
 __all__ = [
     "DERIVED",

@@ -20,7 +20,7 @@ from taojax.core.belief import Places
 from taojax.drive import known_frames
 from taojax.runtime import hindsight
 from taojax.runtime.frames import NO_CANDIDATES, Frame, StreamRecord
-from taojax.runtime.maps import LEAST_ROWS, NEIGHBOURS, MapTables, map_tables
+from taojax.runtime.maps import LEAST_ROWS, NEIGHBOURS, MapTables, capacity, map_tables
 from taojax.runtime.observations import Observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.stream import init, replay
@@ -37,7 +37,7 @@ LEAST_PADDED, GROWTH = 256, 4
 Every size is compiled once."""
 
 LEAST_CELLS, CELLS_GROWTH = 65_536, 16
-"""The same for the cells of its grids."""
+"""The same for the cells of its grids, in coarser sizes than those of a map that stays the same."""
 
 FAR_M = 1e7
 """Where padding lies: nothing is ever near it [m]."""
@@ -70,12 +70,6 @@ def blocks(odometry: np.ndarray, gap_m: float) -> list[Block]:
     ]
 
 
-def _capacity(n: int, least: int, growth: int) -> int:
-    while least < n:
-        least *= growth
-    return least
-
-
 def _padded_grid(grid: AnchorGrid, m: int) -> AnchorGrid:
     """Pad anchors and cells with some that nothing is near to and no list names."""
     n = grid.xy.shape[0]
@@ -85,7 +79,7 @@ def _padded_grid(grid: AnchorGrid, m: int) -> AnchorGrid:
     away[0] = 0.0
     b = grid.neighbour.shape[0]
     neighbour[:b, :n], away[:b, :n] = grid.neighbour, grid.neighbour_m2
-    cells = _capacity(grid.nearest.shape[0], LEAST_CELLS, CELLS_GROWTH)
+    cells = capacity(grid.nearest.shape[0], LEAST_CELLS, CELLS_GROWTH)
     room = lambda leaf, fill: np.concatenate(
         [np.asarray(leaf), np.full((len(own), *leaf.shape[1:]), fill, np.float32)]
     )
@@ -110,7 +104,7 @@ def padded(tables: MapTables) -> MapTables:
     Args:
         tables: of `n` anchors; the same numbers come out of the padded ones.
     """
-    m = _capacity(tables.grid.xy.shape[0], LEAST_PADDED, GROWTH)
+    m = capacity(tables.grid.xy.shape[0], LEAST_PADDED, GROWTH)
     places = tables.places
     return eqx.tree_at(
         lambda t: (t.grid, t.places),

@@ -41,9 +41,9 @@ MOST_UNIT = 4.0
 MAX_CELLS = 1500
 """Cells along the longer side at most; a larger map gets coarser cells, not more memory."""
 
-LEAST_CELL_BITS = 14
-"""Smaller grids are padded to two to the power of this many cells, larger ones to the next power:
-maps of as many rows share compiled programs."""
+LEAST_CELLS, CELLS_GROWTH = 16_384, 2
+"""Cells that a grid is padded to: so many, and so many times as many as that does not suffice. Maps
+of as many rows share compiled programs."""
 
 
 class MapTables(eqx.Module):
@@ -106,6 +106,13 @@ def gap_m(xy: np.ndarray) -> float:
     return float(np.median(nearest[nearest >= 0.25 * np.quantile(nearest, 0.9)]))
 
 
+def capacity(n: int, least: int, growth: int) -> int:
+    """Return the size that n entries are padded to: `least`, times `growth` until they fit."""
+    while least < n:
+        least *= growth
+    return least
+
+
 def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
     xy = poses[:, :2]
     tree = KDTree(xy)
@@ -117,7 +124,7 @@ def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
     points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1).reshape(-1, 2)
     distance, nearest = tree.query(points, distance_upper_bound=reach)
     # Padded, because every length of this table is compiled for anew.
-    cells = np.full(1 << max(int(len(points) - 1).bit_length(), LEAST_CELL_BITS), -1, np.int32)
+    cells = np.full(capacity(len(points), LEAST_CELLS, CELLS_GROWTH), -1, np.int32)
     cells[: len(points)] = np.where(np.isfinite(distance), nearest, -1)
     n_neighbours = min(NEIGHBOURS, len(xy))
     gap, neighbour = tree.query(xy, k=n_neighbours)
