@@ -108,10 +108,12 @@ def test_a_command_that_fails_at_once_leaves_no_folder(tmp_path):
 
 
 def test_a_kidnap_stopped_between_its_runs_keeps_those_that_are_sealed(
-    audited, tmp_path, monkeypatch, capsys
+    tmp_path, monkeypatch, capsys
 ):
+    # Long enough for logs to calibrate on and logs to test on that share no frame.
+    data = write_folder(tmp_path / "data", np.random.default_rng(3), n_query=400)
     out = tmp_path / "out"
-    words = ["kidnap", str(audited / "data"), "--out", str(out), "--trials", "2", "--basin", "2"]
+    words = ["kidnap", str(data), "--out", str(out), "--trials", "2", "--basin", "2"]
     words += ["--rival-trials", "0", "--r-in", "5", *FLAGS]
 
     def score_but_the_last(jobs, config, **more):

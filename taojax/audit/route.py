@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.audit.calibration import LOGISTIC
 from taojax.audit.glossary import names_of_signals
 from taojax.audit.judgement import Judgement
 from taojax.audit.risk import FINAL, NOW
 from taojax.audit.tables import FUSED
+from taojax.detector import probability
 from taojax.plots import OUTCOMES
 from taojax.specs import load_spec
 
@@ -77,8 +77,6 @@ def _signals(judgement: Judgement) -> list[dict[str, Any]]:
     specs = {c["name"]: c for c in load_spec("signals")["columns"] if c.get("signal")}
     table, titles, found = judgement.metrics, names_of_signals(), []
     for name, threshold in zip(table["signal"], table["threshold"], strict=True):
-        if name in LOGISTIC:
-            continue
         spec = specs.get(str(name), {"about": titles[str(name)]})
         found.append(
             {
@@ -112,6 +110,7 @@ def route_json(
     verdicts = judgement.verdicts
     columns = judgement.signals | {name: verdicts[name] for name in (NOW, FINAL)}
     columns[FUSED] = verdicts["probability_map_out"]
+    columns |= {name: probability(own, columns) for name, own in judgement.logistic.items()}
     pose = np.stack([verdicts["x_m"], verdicts["y_m"]], axis=1).astype(float)
     status, status_at = np.unique(judgement.signals["status"].astype(str), return_inverse=True)
     reason, reason_at = np.unique(
