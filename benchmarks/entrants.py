@@ -213,7 +213,7 @@ def _verdicts(
     found = []
     for kind, answer, columns in (
         ("now", both.now, hindsight.now_columns(both.now)),
-        ("final", both.final, hindsight.delayed_columns(tables, both)),
+        ("final", both.final, hindsight.delayed_columns(both.final)),
     ):
         base = getattr(for_run(shipped(), audit.max_wrong, config.verdict.lag), kind)
         place = answer.pose[:, :2].astype(float)

@@ -1,7 +1,8 @@
 """`python -m benchmarks verdict`: what the verdicts are worth on recordings that were left out.
 
 The risk numbers are fitted on pooled recordings. Each family of recordings is left out in turn; the
-numbers of the others judge it as they ship, and refined on its first half. Only calibration halves
+numbers of the others judge it as they ship, and refined on its first half. (The votes of the others'
+pasts rest on first looks that have seen it; that is all that leaks.) Only calibration halves
 of real recordings take part, so that no test half is seen. `--write` fits on all of them and makes
 the default calibration.
 """
@@ -23,9 +24,11 @@ from taojax.audit import labels
 from taojax.audit import risk as judge
 from taojax.audit.calibration import fit_logistic
 from taojax.config import AuditConfig, VerdictConfig
+from taojax.detector import Detector
 from taojax.risk import Calibration, Risk, at_most, probability_wrong
 from taojax.runtime import hindsight
 from taojax.runtime.maps import map_tables
+from taojax.verdicts import POSE
 
 RIDGE = 3.0
 """Precision of the pooled weights around zero, where the recordings weigh 1,000 together. From 1 to
@@ -62,6 +65,8 @@ class Judged(NamedTuple):
     """Columns of delayed.csv."""
 
     answers: judge.Answers
+    odometry: Float[np.ndarray, "t 3"]
+    gap_m: float
 
 
 def answered(recording: Recording, config: VerdictConfig) -> Judged:
@@ -82,38 +87,80 @@ def answered(recording: Recording, config: VerdictConfig) -> Judged:
         recording.name,
         recording.family,
         hindsight.now_columns(both.now),
-        hindsight.delayed_columns(tables_, both),
+        hindsight.delayed_columns(both.final),
         judge.Answers(*own),
+        seen.odometry,
+        float(tables_.places.gap_m),
     )
 
 
 def columns_of(kind: str) -> tuple[str, ...]:
-    """Return the features of one kind of answer."""
-    if kind == "now":
-        return tuple(f"now_{name}" for name in hindsight.FEATURES)
-    return (*hindsight.FEATURES, "change")
+    """Return the features of one kind of answer; the last one is what its past says of it."""
+    return tuple(("now_" if kind == "now" else "") + name for name in hindsight.FEATURES)
 
 
-def _table(one: Judged, kind: str) -> Float[np.ndarray, "t f"]:
+def _table(one: Judged, kind: str, names: Sequence[str]) -> Float[np.ndarray, "t f"]:
     columns = getattr(one, kind)
-    return np.stack([np.asarray(columns[n], float) for n in columns_of(kind)], axis=1)
+    return np.stack([np.asarray(columns[name], float) for name in names], axis=1)
 
 
-def pooled(recordings: Sequence[Judged], kind: str, promise: str) -> Risk:
+def first_look(recordings: Sequence[Judged], kind: str) -> Detector:
+    """Fit how far an answer is trusted before its past is asked, on pooled recordings."""
+    risk = pooled(recordings, kind, "", columns_of(kind)[:-1])
+    note = f"fitted on {len(recordings)} pooled recordings, without what the past says"
+    return Detector(risk.columns, risk.mean, risk.scale, risk.weight, risk.bias, risk.level, note)
+
+
+def recalled(config: VerdictConfig, one: Judged, first: Mapping[str, Detector]) -> Judged:
+    """Ask the past again, trusted by another first look than the shipped one.
+
+    Args:
+        config: settings.
+        one: an answered recording.
+        first: kind of answer -> first look.
+    """
+    for kind, numbers_ in first.items():
+        columns, prefix = getattr(one, kind), "now_" if kind == "now" else ""
+        pose = _table(one, kind, [prefix + name for name in POSE]).astype(np.float32)
+        n = len(pose)
+        answers = hindsight.recall_log(
+            config, numbers_, one.gap_m, one.odometry,
+            hindsight.Answer(pose, np.zeros(n, np.int32), np.zeros((n, 3), np.float32),
+                             _table(one, kind, columns_of(kind)).astype(np.float32)),
+        )  # fmt: skip
+        past = columns_of(kind)[-1]
+        one = one._replace(**{kind: {**columns, past: answers.features[:, -1]}})
+    return one
+
+
+def recalled_apart(config: VerdictConfig, recordings: Sequence[Judged]) -> list[Judged]:
+    """Ask every recording's past by a first look that has not seen its family."""
+    found: dict[str, dict[str, Detector]] = {}
+    for family in sorted({one.family for one in recordings}):
+        others = [one for one in recordings if one.family != family]
+        found[family] = {kind: first_look(others, kind) for kind in ("now", "final")}
+    return [recalled(config, one, found[one.family]) for one in recordings]
+
+
+def pooled(
+    recordings: Sequence[Judged], kind: str, promise: str, names: Sequence[str] | None = None
+) -> Risk:
     """Fit the log odds of being wrong on pooled recordings.
 
     Args:
         recordings: each counts the same, however long, and families by the root of their number.
         kind: now or final.
         promise: what the numbers say of themselves.
+        names: the features; all when omitted.
     """
+    names = columns_of(kind) if names is None else tuple(names)
     n_family = {one.family: 0.0 for one in recordings}
     for one in recordings:
         n_family[one.family] += 1.0
     xs, ys, ws = [], [], []
     for one in recordings:
         own = getattr(one.answers, kind)
-        xs.append(_table(one, kind))
+        xs.append(_table(one, kind, names))
         ys.append(own.is_wrong)
         ws.append(np.full(len(xs[-1]), 1.0 / len(xs[-1]) / np.sqrt(n_family[one.family])))
     x, y, w = np.concatenate(xs), np.concatenate(ys), np.concatenate(ws)
@@ -134,7 +181,7 @@ def pooled(recordings: Sequence[Judged], kind: str, promise: str) -> Risk:
     )
     shares = np.array(MAX_WRONGS)
     levels = LEVEL_OVER_SHARE * shares
-    return Risk(columns_of(kind), mean, scale, q[:-1], float(q[-1]), shares, levels, 0.05, promise)
+    return Risk(names, mean, scale, q[:-1], float(q[-1]), shares, levels, 0.05, promise)
 
 
 def halves(one: Judged) -> tuple[Bool[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
@@ -253,6 +300,7 @@ def run(out: Path, data: Path, *, only: str, write: bool) -> None:
         if only in name:
             judged.append(answered(make(), config))
             jax.clear_caches()  # thousands of compiled shapes exhaust a process's memory maps
+    judged = recalled_apart(config, judged)
     rows = left_out(judged)
     out.mkdir(parents=True, exist_ok=True)
     write_rows(out / "verdict.csv", rows)
@@ -263,6 +311,11 @@ def run(out: Path, data: Path, *, only: str, write: bool) -> None:
     (out / "verdict.md").write_text("\n".join(f"- {line}" for line in lines) + "\n")
     print("\n".join(lines))
     if write:
-        path = Path(numbers.__file__).with_name(numbers.DEFAULT)
-        path.write_text(default_calibration(judged, rows), encoding="utf-8")
-        print(f"wrote {path.name}")
+        folder = Path(numbers.__file__).parent
+        looks = {kind: first_look(judged, kind) for kind in ("now", "final")}
+        for name, text in (
+            (numbers.DEFAULT, default_calibration(judged, rows)),
+            (numbers.FIRST_LOOK, numbers.first_to_toml(looks)),
+        ):
+            (folder / name).write_text(text, encoding="utf-8")
+            print(f"wrote {name}")

@@ -25,7 +25,7 @@ LARGEST_LOG_ODDS = 30.0
 SCHEMA = 2
 """Of calibration.toml; files of 0.1.0 have none."""
 
-DEFAULT = "default_calibration.toml"
+DEFAULT, FIRST_LOOK = "default_calibration.toml", "first_look.toml"
 
 SHIPPED = "the calibration that ships with taojax"
 """Where numbers come from that no site has refined."""
@@ -62,6 +62,15 @@ class Risk(NamedTuple):
         """Return the level of the largest share on file that is not above what is asked for."""
         fits = np.flatnonzero(self.max_wrongs <= self.max_wrong * (1.0 + 1e-9))
         return float(self.levels[fits[-1]]) if fits.size else float("nan")
+
+
+class First(NamedTuple):
+    """Trust in an answer before its past is asked; the package's own, no site changes it."""
+
+    now: Detector
+    """Its threshold is the probability of being wrong at which an answer counts half."""
+
+    final: Detector
 
 
 class Calibration(NamedTuple):
@@ -138,6 +147,13 @@ def _section(name: str, numbers: Risk | Detector) -> list[str]:
             text = repr(float(value))
         lines.append(f"{field} = {text}")
     return [*lines, ""]
+
+
+def first_to_toml(detectors: Mapping[str, Detector]) -> str:
+    """Return the numbers of the first look, `now` and `final`, as text."""
+    head = "# Written by `python -m benchmarks verdict --write`."
+    both = (line for name, one in detectors.items() for line in _section(name, one))
+    return "\n".join([head, "", *both]).rstrip("\n") + "\n"
 
 
 def to_toml(calibration: Calibration) -> str:
@@ -229,3 +245,14 @@ def shipped() -> Calibration:
     """Return the calibration that ships with the package, fitted on pooled recordings."""
     text = resources.files("taojax").joinpath(DEFAULT).read_text(encoding="utf-8")
     return _parse(text, DEFAULT)
+
+
+@lru_cache(maxsize=1)
+def first_look() -> First:
+    """Return the first look that ships with the package, fitted on pooled recordings."""
+    text = resources.files("taojax").joinpath(FIRST_LOOK).read_text(encoding="utf-8")
+    tree = tomllib.loads(text)
+    return First(*(
+        Detector(*_model(tree[kind], spec), float(tree[kind]["threshold"]), str(tree[kind]["note"]))
+        for kind, spec in (("now", "signals"), ("final", "delayed"))
+    ))  # fmt: skip

@@ -224,7 +224,7 @@ def test_a_map_of_one_place_many_times_over_leaves_every_number_finite(rng):
 def judged_final(tables, both):
     """Return final and causal verdicts by the shipped numbers, and the final probabilities."""
     ok = np.full(len(both.now.map_index), "ok", dtype=object)
-    final = judged(shipped().final, hindsight.delayed_columns(tables, both), ok)
+    final = judged(shipped().final, hindsight.delayed_columns(both.final), ok)
     now = judged(shipped().now, hindsight.now_columns(both.now), ok)
     return np.stack([final[0], now[0]]), final[2]
 

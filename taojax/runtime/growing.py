@@ -18,6 +18,7 @@ from taojax.config import Config, VerdictConfig
 from taojax.core.anchors import AnchorGrid
 from taojax.core.belief import Places
 from taojax.drive import known_frames
+from taojax.risk import first_look
 from taojax.runtime import hindsight
 from taojax.runtime.frames import NO_CANDIDATES, Frame, StreamRecord
 from taojax.runtime.maps import LEAST_ROWS, NEIGHBOURS, MapTables, capacity, map_tables
@@ -170,8 +171,8 @@ class Grown(NamedTuple):
 
 class _Part(NamedTuple):
     record: StreamRecord
-    now: dict[str, np.ndarray]
-    delayed: dict[str, np.ndarray]
+    both: hindsight.Both
+    gap_m: np.ndarray
 
 
 def _replayed(
@@ -195,8 +196,8 @@ def _replayed(
     both = jax.tree.map(lambda leaf: leaf[rows], both)
     return _Part(
         jax.tree.map(lambda leaf: np.asarray(leaf)[rows], record),
-        hindsight.now_columns(both.now),
-        hindsight.delayed_columns(tables, both),
+        both,
+        np.full(rows.stop - rows.start, tables.places.gap_m, np.float32),
     )
 
 
@@ -255,5 +256,12 @@ def replay_growing(
         rows = slice(block.first - first, block.end - first)
         parts.append(_replayed(config, padded(tables), log, rows, WARM + BLOCK))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    joined.delayed["frame"] = np.arange(len(odometry))
-    return Grown(joined.record, joined.now, joined.delayed, tables)
+    # A block's own replay knows its warm-up alone; the past is the whole drive's.
+    still = np.where(np.isfinite(odometry).all(axis=1, keepdims=True), odometry, 0.0)
+    now, final = (
+        hindsight.recall_log(config.verdict, first, joined.gap_m, still, answers)
+        for first, answers in zip(first_look(), joined.both, strict=True)
+    )
+    return Grown(
+        joined.record, hindsight.now_columns(now), hindsight.delayed_columns(final), tables
+    )

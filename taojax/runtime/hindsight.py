@@ -28,8 +28,17 @@ from taojax.core.belief import (
     uninformed,
     weigh,
 )
+from taojax.core.history import (
+    FirstLook,
+    History,
+    contradiction,
+    first_trust,
+    no_history,
+)
 from taojax.core.path import Support, Window, support
 from taojax.core.se2 import between, compose, inverse, transform
+from taojax.detector import Detector
+from taojax.risk import first_look
 from taojax.runtime.maps import MapTables
 from taojax.runtime.scale import rescale
 
@@ -53,7 +62,7 @@ FEATURES = (
     "level_short", "level", "level_long",
     "cost_short", "cost", "cost_long",
     "vote_short", "vote", "vote_long",
-    "listed", "agree", "own", "unseen",
+    "listed", "agree", "own", "unseen", "contradiction",
 )  # fmt: skip
 """What is said of an answer, now and finally; larger = more likely wrong. See
 data_specs/delayed.toml."""
@@ -181,6 +190,7 @@ def _features(  # noqa: PLR0913 - what one answer is tried on
             1.0 - agree / jnp.maximum(found.frames[2], 1e-9),
             own,
             1.0 / (1.0 + found.frames[1]),
+            0.0,  # contradiction: `recalled` knows, once this answer is final
         ]),
     ])  # fmt: skip
 
@@ -480,6 +490,73 @@ CHUNK = 250
 """Frames per compiled scan, about."""
 
 
+def as_first_look(numbers: Detector) -> FirstLook:
+    """Return frozen numbers as arrays."""
+    parts = numbers.mean, numbers.scale, numbers.weight, numbers.bias, numbers.threshold
+    return FirstLook(*(jnp.asarray(part, jnp.float32) for part in parts))
+
+
+@eqx.filter_jit
+def recalled(  # noqa: PLR0913 - a log, and what its answers are held against
+    config: VerdictConfig,
+    first: FirstLook,
+    history: History,
+    gap_m: Float[Array, " t"],
+    odometry: Float[Array, "t 3"],
+    answers: Answer,
+) -> tuple[History, Answer]:
+    """Say of each answer how far those before it contradict it.
+
+    Args:
+        config: settings.
+        first: trust before the past is asked.
+        history: of the frames before.
+        gap_m: median distance between neighbouring anchors of the map that a frame knows [m].
+        odometry: into each frame.
+        answers: causal or final ones, in order.
+    """
+
+    def ask(history: History, frame: tuple[Array, ...]) -> tuple[History, Array]:
+        gap, motion, pose, features = frame
+        trust = first_trust(first, features[:-1])
+        history, against = contradiction(config, gap, history, motion, pose, trust)
+        return history, features.at[-1].set(against)
+
+    every = gap_m, odometry, answers.pose, answers.features
+    history, features = jax.lax.scan(ask, history, every)
+    return history, eqx.tree_at(lambda a: a.features, answers, features)
+
+
+def recall_log(
+    config: VerdictConfig,
+    numbers: Detector,
+    gap_m: np.ndarray | float,
+    odometry: np.ndarray,
+    answers: Answer,
+) -> Answer:
+    """Run `recalled` over a whole log of answers, NumPy in and out.
+
+    Args:
+        config: settings.
+        numbers: of the first look.
+        gap_m: median distance between neighbouring anchors [m], of the map or frame by frame.
+        odometry: `(T, 3)`, from `clean`.
+        answers: of the log.
+    """
+    total, history, parts = len(odometry), no_history(), []
+    first = as_first_look(numbers)
+    gaps = np.broadcast_to(np.asarray(gap_m, np.float32), (total,))
+    for low in range(0, total, CHUNK):
+        rows, room = slice(low, low + CHUNK), max(0, low + CHUNK - total)
+        pad = lambda leaf, room=room, rows=rows: jnp.asarray(
+            np.pad(leaf[rows], [(0, room)] + [(0, 0)] * (leaf.ndim - 1), mode="edge")
+        )
+        log = jax.tree.map(pad, (gaps, odometry, answers))
+        history, part = recalled(config, first, history, *log)
+        parts.append(jax.tree.map(np.asarray, part))
+    return _joined(parts, total)
+
+
 def _joined(parts: list[Answer], total: int) -> Answer:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *parts)
 
@@ -513,7 +590,8 @@ def replay_both(
         nows.append(jax.tree.map(np.asarray, answers))
         kept = jax.tree.map(np.asarray, kept)
         starts += [jax.tree.map(lambda leaf, b=b: leaf[b], kept) for b in range(width // n)]
-    now = _joined(nows, total)
+    gap_m = float(tables.places.gap_m)
+    now = recall_log(config, first_look().now, gap_m, seen.odometry, _joined(nows, total))
     if config.lag == 0:
         return Both(now, now)
     far = reach(config, tables.places, seen.odometry)
@@ -522,7 +600,8 @@ def replay_both(
         final_block(config, tables, seen, now.pose, starts[at // n], at, far)
         for at in tqdm(range(0, total, n), **said)
     ]
-    return Both(now, _joined(finals, total))
+    final = recall_log(config, first_look().final, gap_m, seen.odometry, _joined(finals, total))
+    return Both(now, final)
 
 
 def final_block(  # noqa: PLR0913 - a log and where to cut it
@@ -565,6 +644,17 @@ class Follower:
         self._starts: list[tuple[Belief, Array]] = []
         self._first, self._due = 0, 0
         self.state = init(config, tables)
+        self._first_look = {k: as_first_look(v) for k, v in first_look()._asdict().items()}
+        self._histories = dict.fromkeys(self._first_look, no_history())
+
+    def _asked(self, kind: str, odometry: np.ndarray, answers: Answer) -> Answer:
+        """Hold answers against those before them, in order."""
+        gap_m = jnp.broadcast_to(self._tables.places.gap_m, (len(odometry),))
+        self._histories[kind], answers = recalled(
+            self._config, self._first_look[kind], self._histories[kind],
+            gap_m, jnp.asarray(odometry), jax.tree.map(jnp.asarray, answers),
+        )  # fmt: skip
+        return jax.tree.map(np.asarray, answers)
 
     def push(self, seen: Seen) -> tuple[Answer, list[Finished]]:
         """Take in one frame; return its causal answer, and the blocks that are final now.
@@ -576,7 +666,10 @@ class Follower:
         if number % block_frames(self._config) == 0:
             self._starts.append((self.state.belief, self.state.pending))
         self.state, answer = advance(self._config, self._tables, self.state, seen)
-        answer = jax.tree.map(np.asarray, answer)
+        one = self._asked(
+            "now", np.asarray(seen.odometry)[None], jax.tree.map(lambda leaf: leaf[None], answer)
+        )
+        answer = jax.tree.map(lambda leaf: leaf[0], one)
         self._seen.append(seen)
         self._now.append(answer)
         return answer, self._finished(is_over=False)
@@ -607,7 +700,10 @@ class Follower:
             rows = slice(at, min(at + n, last + 1))
             of_final = slice(0, rows.stop - rows.start) if config.lag else rows
             take = lambda answer, rows: jax.tree.map(lambda leaf: leaf[rows], answer)
-            done.append(Finished(self._due, take(now, rows), take(final, of_final)))
+            final = take(final, of_final)
+            if config.lag:
+                final = self._asked("final", odometry[rows], final)
+            done.append(Finished(self._due, take(now, rows), final))
             self._due += n
             self._starts.pop(0)
             spare = self._due - self._first - reach_frames(config)
@@ -657,12 +753,10 @@ def now_columns(now: Answer) -> dict[str, np.ndarray]:
     }
 
 
-def delayed_columns(tables: MapTables, both: Both) -> dict[str, np.ndarray]:
+def delayed_columns(final: Answer) -> dict[str, np.ndarray]:
     """Return the columns of delayed.csv."""
-    final = both.final
-    moved = np.hypot(*(final.pose[:, :2] - both.now.pose[:, :2]).T) / float(tables.places.gap_m)
     return {
-        "frame": np.arange(len(moved)),
+        "frame": np.arange(len(final.pose)),
         "map_index": np.asarray(final.map_index),
         "x_m": final.pose[:, 0],
         "y_m": final.pose[:, 1],
@@ -671,5 +765,4 @@ def delayed_columns(tables: MapTables, both: Both) -> dict[str, np.ndarray]:
         "var_y_m2": final.covariance[:, 1],
         "cov_xy_m2": final.covariance[:, 2],
         **{name: final.features[:, at] for at, name in enumerate(FEATURES)},
-        "change": np.minimum(moved, FARTHEST),
     }

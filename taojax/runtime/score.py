@@ -182,7 +182,7 @@ def score(
         said = rival_tracks(observations, frames, most_logs=rival_logs, progress=progress)
         tracks = {"tao_rank": sealed_track(literal, "tao_rank"), **said}
     table = signal_table(observations.t_s, records) | hindsight.now_columns(both.now)
-    delayed = hindsight.delayed_columns(tables, both)
+    delayed = hindsight.delayed_columns(both.final)
     notes = [check_refinement(config, records, replayed)] if config.stream.refine else []
     said = _Said(table, delayed, index, similarity, tables, notes, tracks)
     return _sealed(dataset, out, config, observations, calibration, said)

@@ -285,9 +285,7 @@ class Watch:
     def _finals(self, finished: list[hindsight.Finished]) -> list[dict[str, Any]]:
         lines = []
         for block in finished:
-            columns = hindsight.delayed_columns(
-                self._tables, hindsight.Both(block.now, block.final)
-            )
+            columns = hindsight.delayed_columns(block.final)
             n = len(columns["frame"])
             before = [self._waiting.popleft() for _ in range(n)]
             status = np.array([one[1] for one in before], dtype=object)
