@@ -497,7 +497,7 @@ def as_first_look(numbers: Detector) -> FirstLook:
 
 
 @eqx.filter_jit
-def recalled(  # noqa: PLR0913 - a log, and what its answers are held against
+def recalled(
     config: VerdictConfig,
     first: FirstLook,
     history: History,
