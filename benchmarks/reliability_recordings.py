@@ -116,12 +116,13 @@ def _drive_files(folder: Path) -> None:
 
 def _read_drive(kind: str, folder: Path, out: Path) -> list[np.ndarray]:
     from taojax.datasets.odometry import odometry_at, read_odometry
+    from taojax.datasets.reading import Reading
 
     name = {"steps": "steps.csv", "robotcar-vo": "query/vo/vo.csv", "wheels": "query"}.get(
         kind, f"drive.{kind}"
     )
     times = folder / "times.txt" if kind == "kitti" else None
-    drive = read_odometry(folder / name, kind, times=times)  # type: ignore[arg-type]
+    drive = read_odometry(folder / name, kind, Reading(times=times)).poses  # type: ignore[arg-type]
     motion, _ = odometry_at(drive, drive.t_s, 0.5)
     return [drive.t_s, drive.xyt, motion]
 
