@@ -1,8 +1,9 @@
 """Descriptors of images: a user's network, or GIST without any.
 
 GIST is the energy of 8 directions of edges at 3 scales in 8 x 8 places of the image (Oliva and
-Torralba, IJCV 42, 2001). Of three classical descriptors on rendered streets (see `data_specs`) it
-found most places again.
+Torralba, IJCV 42, 2001). On 394 rendered thermal views of a street, driven again with another gain,
+offset, scale, noise and cars in the way, it found .86 of the places within one view, a HOG of a
+normalised thumbnail .51, patch-normalised pixels .36.
 """
 
 import dataclasses
@@ -12,15 +13,21 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from taojax.datasets.images import (
-    COMMAND, Preparation, eight_bit, kind_of_image, list_images, names_below, read_image,
+    COMMAND,
+    Preparation,
+    eight_bit,
+    kind_of_image,
+    list_images,
+    names_below,
+    read_image,
 )  # fmt: skip
-from taojax.errors import InputError, MissingExtraError
+from taojax.errors import MissingExtraError
 from taojax.records import digest_file
 from taojax.specs import fail, first_line, write_atomically
 
@@ -42,12 +49,8 @@ DYNAMIC = 14
 """Sides of an input of any size are cut to multiples of this, the patch of DINOv2."""
 
 
-class Describer(Protocol):
-    """What turns prepared images into rows."""
-
-    def __call__(self, images: Sequence[UInt8[np.ndarray, "..."]]) -> Float[np.ndarray, "n d"]:
-        """Return one row per image."""
-        ...
+Describer = Callable[[Sequence[np.ndarray]], np.ndarray]
+"""Turns prepared images into one row each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +61,11 @@ class Network:
     size: tuple[int, int] | None = None
     """Width and height; None: as the model says, else the image's own, in multiples of 14."""
 
-    mean: tuple[float, ...] = IMAGENET[0]
-    deviation: tuple[float, ...] = IMAGENET[1]
+    mean: tuple[float, ...] | None = None
+    """Of each channel, from 0 to 1; None: ImageNet's, of one channel 0."""
+
+    deviation: tuple[float, ...] | None = None
+    """None: ImageNet's, of one channel 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,10 +162,9 @@ def _network(own: Network) -> tuple[Describer, dict[str, Any]]:
     if own.size is not None and fixed not in (None, own.size):
         raise fail(own.path, f"wants {fixed[0]} x {fixed[1]} pixels", "leave --size away")
     size = own.size or fixed
-    mean, deviation = (np.float32(v[:channels] if channels == 1 and len(v) != 3 else v)
-                       for v in (own.mean, own.deviation))  # fmt: skip
-    if channels == 1 and len(own.mean) == 3:
-        mean, deviation = np.float32([0.0]), np.float32([1.0])
+    usual = IMAGENET if channels == 3 else ((0.0,), (1.0,))
+    mean = np.array((own.mean or usual[0])[:channels], np.float32)
+    deviation = np.array((own.deviation or usual[1])[:channels], np.float32)
     one_by_one = isinstance(shape[0], int) and shape[0] == 1
 
     def rows(images: Sequence[np.ndarray]) -> np.ndarray:
