@@ -1,8 +1,8 @@
 """`python -m benchmarks verdict`: what the verdicts are worth on recordings that were left out.
 
 The risk numbers are fitted on pooled recordings. Each family of recordings is left out in turn; the
-numbers of the others judge it as they ship, and refined on its first half. (The votes of the others'
-pasts rest on first looks that have seen it; that is all that leaks.) Only calibration halves
+numbers of the others judge it as they ship, and refined on its first half. (What the past says in
+the others rests on first looks that have seen it; that is all that leaks.) Only calibration halves
 of real recordings take part, so that no test half is seen. `--write` fits on all of them and makes
 the default calibration.
 """

@@ -23,6 +23,7 @@ from taojax.verbs import (
     closures,
     compare,
     convert,
+    describe,
     doctor,
     evaluate,
     explain,
@@ -45,6 +46,7 @@ Verb = (
     | score.Score
     | evaluate.Evaluate
     | convert.Convert
+    | describe.Describe
     | inspect.Inspect
     | simulate.Simulate
     | kidnap.Kidnap
@@ -64,6 +66,7 @@ RUN = {
     score.Score: score.run,
     evaluate.Evaluate: evaluate.run,
     convert.Convert: convert.run,
+    describe.Describe: describe.run,
     inspect.Inspect: inspect.run,
     simulate.Simulate: simulate.run,
     kidnap.Kidnap: kidnap.run,

@@ -16,7 +16,7 @@ FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-prog
 """Rank compiles in a fraction of the time; what is tested does not depend on it."""
 VERBS = (
     "audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export", "convert",
-    "inspect",
+    "describe", "inspect",
     "compare", "doctor", "rerun",
     "closures", "explain", "graph", "watch",
 )  # fmt: skip

@@ -74,9 +74,6 @@ _UNITS = ("seconds", "milliseconds", "microseconds", "nanoseconds")
 _VERTICES = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
 _Q = ("qx", "qy", "qz", "qw")
 _R = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
-_TUM = ("t_s", "x_m", "y_m", "z_m", *_Q)
-_EUROC = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-_KITTI = ("r11", "r12", "r13", "x_m", "r21", "r22", "r23", "y_m", "r31", "r32", "r33", "z_m")
 _OURS = ("t_s", "x_m", "y_m", "theta_rad")
 KNOWN = "x,y,theta, t,x,y,z,qx,qy,qz,qw or dx,dy,dtheta"
 
@@ -173,6 +170,13 @@ def _laid(names: Sequence[str], first: int = 0) -> dict[str, list[Column]]:
     return {name: [Column(first + at, name, None, name)] for at, name in enumerate(names)}
 
 
+def _layout(name: str) -> list[str]:
+    """Return the columns of a format as its spec has them, those of a pose alone."""
+    spec = load_spec(name)
+    names = spec["layouts"][0] if "layouts" in spec else [c["name"] for c in spec["columns"]]
+    return ["t_s" if own == "t_ns" else own for own in names]
+
+
 def _by_width(path: Path, table: TextRows, kind: str | None) -> Found:
     """Tell columns without names by their number and by what stands in them."""
     width = len(table.columns)
@@ -184,14 +188,14 @@ def _by_width(path: Path, table: TextRows, kind: str | None) -> Found:
     between = "" if table.separator == " " else f" with {NAMES[table.separator]} between the cells"
     is_fine = _is_fine(table)
     if kind == "euroc" and 8 <= width <= 17:
-        return Found(_laid(_EUROC), "read as euroc", "ns")
+        return Found(_laid(_layout("euroc")), "read as euroc", "ns")
     if kind in (None, "kitti", "csv") and (known := _by_matrix(table, between)) is not None:
         return known
     if width == 8 and kind != "kitti" and (kind == "tum" or not is_fine):
-        return Found(_laid(_TUM), f"read as tum{between}", "s")
+        return Found(_laid(_layout("tum")), f"read as tum{between}", "s")
     if 8 <= width <= 17 and is_fine and kind != "kitti":
         said = "no header, whole stamps: read as euroc"
-        return Found(_laid(_EUROC), said, "ns", is_certain=False)
+        return Found(_laid(_layout("euroc")), said, "ns", is_certain=False)
     if (known := _by_quaternion(table, between)) is not None:
         return known
     if kind in ("tum", "kitti"):
@@ -211,7 +215,7 @@ def _by_matrix(table: TextRows, between: str) -> Found | None:
         return None
     begin = width % 2
     frame = {"frame": [Column(0, "frame", None, "")]} if begin else {}
-    return Found(_laid(_KITTI, begin) | frame, f"read as kitti{between}")
+    return Found(_laid(_layout("kitti"), begin) | frame, f"read as kitti{between}")
 
 
 def _by_quaternion(table: TextRows, between: str) -> Found | None:
@@ -219,9 +223,9 @@ def _by_quaternion(table: TextRows, between: str) -> Found | None:
     width = len(table.columns)
     is_turn = np.abs(np.linalg.norm(_last_four(table), axis=1) - 1).max() <= UNIT_LENGTH
     if width == 9 and is_turn and _is_count(table.columns[0]):
-        return Found(_laid(_TUM, 1), f"read as tum behind a row number{between}", "s")
+        return Found(_laid(_layout("tum"), 1), f"read as tum behind a row number{between}", "s")
     if width == 7 and is_turn:
-        return Found(_laid(_TUM[1:]), "no header: read as x,y,z,qx,qy,qz,qw")
+        return Found(_laid(_layout("tum")[1:]), "no header: read as x,y,z,qx,qy,qz,qw")
     return None
 
 

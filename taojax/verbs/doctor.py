@@ -20,6 +20,7 @@ EXTRAS = {
     "export": (("flatbuffers",), "taojax export"),
     "graph": (("gtsam",), "taojax graph"),
     "ros": (("rosbags",), "odometry out of ROS bags"),
+    "images": (("cv2", "onnxruntime"), "taojax describe"),
     "cuda": (("jax_cuda13_plugin",), "an NVIDIA GPU"),
     "notebooks": (("jupytext", "jupyterlab"), "the notebooks"),
     "test": (("pytest", "hypothesis", "beartype", "importlinter", "jaxlie"), "the tests"),

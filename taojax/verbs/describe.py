@@ -1,0 +1,79 @@
+"""`taojax describe`: a folder of images becomes descriptors."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taojax.errors import UsageError
+from taojax.verbs.common import flag, say
+
+
+@dataclasses.dataclass(frozen=True)
+class Describe:
+    """Describe the images of a folder, thermal or RGB, by a model of yours or by GIST.
+
+    Example: taojax describe my_images --out map.npy
+    """
+
+    images: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES")]
+    """Folder of 8- or 16-bit images; one row each, in the order of their names or numbers."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.npy")]
+    """Rows; how they were made goes to FILE.toml beside."""
+
+    model: Annotated[Path | None, flag("FILE.onnx", "GIST, a classical descriptor")] = None
+    """Model with one image input (N, 1 or 3, H, W)."""
+
+    size: Annotated[tuple[int, int] | None, flag("W H", "as the model says")] = None
+    """Pixels of the model's input."""
+
+    mean: Annotated[tuple[float, float, float] | None, flag("R G B", "ImageNet's")] = None
+    """Subtracted from pixels of 0 to 1."""
+
+    deviation: Annotated[tuple[float, float, float] | None, flag("R G B", "ImageNet's")] = None
+    """What they are divided by then."""
+
+    percentiles: tuple[float, float] = (1.0, 99.0)
+    """Of each thermal image: what becomes black and white."""
+
+    clahe: float = 2.0
+    """Clip limit of the equalisation of thermal images, 0 for none."""
+
+    batch: int = 16
+    """Images at a time."""
+
+    progress: bool = True
+    """Draw a progress bar."""
+
+
+def run(args: Describe) -> None:
+    """Describe and say what comes next."""
+    low, high = args.percentiles
+    if not 0 <= low < high <= 100:
+        raise UsageError(f"--percentiles {low:g} {high:g} must rise within 0 to 100")
+    if args.batch < 1:
+        raise UsageError(f"--batch {args.batch} must be at least 1")
+    told = {name: getattr(args, name) for name in ("size", "mean", "deviation")}
+    told = {name: value for name, value in told.items() if value is not None}
+    if told and args.model is None:
+        raise UsageError(f"--{next(iter(told))} goes with --model")
+    from tqdm import tqdm
+
+    from taojax.datasets.describe import Network, describe
+    from taojax.datasets.images import Preparation
+
+    made = describe(
+        args.images,
+        args.out,
+        how=Preparation(low, high, args.clahe),
+        network=None if args.model is None else Network(args.model, **told),
+        batch=args.batch,
+        tell=lambda starts: iter(
+            tqdm(starts, desc="describe", unit="batch", disable=not args.progress)
+        ),
+    )
+    resumed = f", {made.n_resumed:,} of them from an interrupted run" if made.n_resumed else ""
+    say(f"{made.n_images:,} images ({made.kind}), in the order of their {made.order}{resumed}")
+    say(f"wrote {args.out}: {made.n_images:,} x {made.dimension:,}; how: {args.out.stem}.toml")
