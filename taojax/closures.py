@@ -17,15 +17,17 @@ from jaxtyping import Bool, Float, Int, Shaped
 from taojax.config import StreamConfig, from_toml
 from taojax.errors import InputError
 from taojax.records import Run
-from taojax.risk import Calibration
+from taojax.risk import Calibration, for_run
 from taojax.risk import from_toml as read_calibration
 from taojax.specs import fail, read_text
 from taojax.tables import MOTION, POSE, read_frames, read_table, stacked
+from taojax.verdicts import decide
 
 __all__ = [
     "Graph",
     "Verdicts",
     "as_verdicts",
+    "at_share",
     "between",
     "build_graph",
     "compose",
@@ -178,6 +180,32 @@ def as_verdicts(source: str, table: Mapping[str, np.ndarray], numbers: Calibrati
         stacked(table, ("x_now_m", "y_now_m", "theta_now_rad")),
         numbers,
     )
+
+
+def at_share(
+    folder: Path, run: Run, verdicts: Verdicts, max_wrong: float | None, lag: int | None
+) -> Verdicts:
+    """Decide again by the same numbers, for another share of wrong answers.
+
+    Args:
+        folder: the run.
+        run: read from it.
+        verdicts: what was decided there.
+        max_wrong: share of the accepted answers that may be wrong, in (0, 1); None = as it was.
+        lag: that the run must have been scored with; None = any.
+
+    Raises:
+        InputError: the run was scored with another lag.
+    """
+    own = from_toml(folder / "config.toml").verdict.lag
+    if lag is not None and lag != own:
+        fix = f"score the data again with --lag {lag}"
+        raise fail(folder / "config.toml", f"its final verdicts wait {own} frames", fix)
+    if max_wrong is None:
+        return verdicts
+    numbers = for_run(verdicts.calibration, max_wrong, own)
+    table = decide(numbers, run.signals, run.delayed)
+    return as_verdicts(f"{verdicts.source}, decided again,", table, numbers)
 
 
 def wrap(angle: np.ndarray | float) -> np.ndarray:

@@ -303,3 +303,25 @@ def test_a_run_sealed_without_odometry_is_told_to_score_again(run, tmp_path):
     verdicts, sealed = closures.read_verdicts(run, records.read_run(run)), records.read_run(folder)
     with pytest.raises(InputError, match="score the data set again"):
         closures.build_graph(folder, sealed, verdicts)
+
+
+def test_another_share_of_wrong_ones_decides_again_and_another_lag_is_refused(
+    scored, run, tmp_path, capsys
+):
+    counts = {}
+    for share in ("0.01", "0.2"):
+        words = ["--out", str(tmp_path / share), "--max-wrong", share, "--lag", "4"]
+        assert main(["closures", str(run), *words]) == 0
+        said = capsys.readouterr().out
+        assert "decisions.csv, decided again," in said
+        counts[share] = int(re.search(r"closures.g2o +(\d+) accepted", said)[1])
+        again = scored / f"again{share}"
+        words = ["--calibration", str(scored / "calibration.toml"), "--max-wrong", share]
+        assert main(["score", str(scored / "data"), "--out", str(again), *words, *FLAGS]) == 0
+        assert counts[share] == (records.read_run(again).decisions["verdict"] == "accept").sum()
+    assert counts["0.01"] <= counts["0.2"]
+    capsys.readouterr()
+    assert main(["closures", str(run), "--lag", "7", "--out", str(tmp_path / "no")]) == 3
+    assert "wait 4 frames; score the data again with --lag 7" in capsys.readouterr().err
+    assert main(["closures", str(run), "--max-wrong", "1.5"]) == 2
+    assert not (tmp_path / "no").exists()

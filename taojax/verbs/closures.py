@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.errors import InputError
+from taojax.errors import InputError, UsageError
 from taojax.verbs.common import flag, say
 
 if TYPE_CHECKING:
@@ -26,10 +26,16 @@ class Closures:
     out: Annotated[Path | None, flag("DIR", "RUN")] = None
     """Where to write closures.g2o, rejected.g2o and trajectory.tum."""
 
+    max_wrong: Annotated[float | None, flag("SHARE", "as decided")] = None
+    """Share of the accepted closures that may be wrong; decides again by the run's numbers."""
+
+    lag: Annotated[int | None, flag("FRAMES", "the run's")] = None
+    """Frames that final verdicts wait for; a run scored with another lag is refused."""
+
 
 def run(args: Closures) -> None:
     """Write the files."""
-    from taojax.closures import build_graph, g2o_text, read_verdicts, tum_text
+    from taojax.closures import at_share, build_graph, g2o_text, read_verdicts, tum_text
     from taojax.records import read_run
     from taojax.specs import write_atomically
 
@@ -40,6 +46,9 @@ def run(args: Closures) -> None:
             f"{args.run}: nothing is decided here; judge it with `taojax evaluate`, or score with"
             " --calibration"
         )
+    if args.max_wrong is not None and not 0.0 < args.max_wrong < 1.0:
+        raise UsageError(f"--max-wrong ({args.max_wrong:g}) must be between 0 and 1")
+    verdicts = at_share(args.run, sealed, verdicts, args.max_wrong, args.lag)
     graph, folder = build_graph(args.run, sealed, verdicts), args.out or args.run
     trajectory, told = tum_text(graph), _of_the_audit(args.run, verdicts)
     files = {
@@ -76,7 +85,7 @@ def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
         return None
     labels = read_frames(run / "labels.csv", "labels", len(verdicts.verdict))
     accepted, where = verdicts.verdict == "accept", "all frames"
-    if verdicts.source == "verdicts.csv":
+    if verdicts.source.startswith("verdicts.csv"):
         # Its numbers were fitted on the other half of the same run.
         accepted, where = accepted & (labels["split"] == "test"), "the test half"
     n, n_off = int(accepted.sum()), int((accepted & (labels["label"] == "map_out")).sum())
