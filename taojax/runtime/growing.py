@@ -37,8 +37,8 @@ LEAST_PADDED, GROWTH = 256, 4
 """Anchors that a map is padded to: so many, and so many times as many as that does not suffice.
 Every size is compiled once."""
 
-LEAST_CELLS, CELLS_GROWTH = 65_536, 16
-"""The same for the cells of its grids, in coarser sizes than those of a map that stays the same."""
+LEAST_CELLS, CELLS_GROWTH = 1_048_576, 16
+"""The same for the cells of its grids; most drives fit the first size."""
 
 FAR_M = 1e7
 """Where padding lies: nothing is ever near it [m]."""
