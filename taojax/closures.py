@@ -205,7 +205,7 @@ def at_share(
         return verdicts
     numbers = for_run(verdicts.calibration, max_wrong, own)
     table = decide(numbers, run.signals, run.delayed)
-    return as_verdicts(f"{verdicts.source}, decided again,", table, numbers)
+    return as_verdicts(verdicts.source, table, numbers)
 
 
 def wrap(angle: np.ndarray | float) -> np.ndarray:

@@ -195,6 +195,10 @@ def _model(
     return columns, vectors[0], vectors[1], vectors[2], bias
 
 
+def _detector(tree: Mapping[str, Any], spec: str) -> Detector:
+    return Detector(*_model(tree, spec), float(tree["threshold"]), str(tree["note"]))
+
+
 def _risk(tree: Mapping[str, Any], spec: str) -> Risk:
     model = _model(tree, spec)
     shares, levels = np.array(tree["max_wrongs"], float), np.array(tree["levels"], float)
@@ -223,8 +227,7 @@ def _parse(text: str, where: str) -> Calibration:
                 float(seen["spacing_m"]), float(seen["recall"]),
             )  # fmt: skip
         if (old := tree.get("map_out")) is not None:
-            threshold = float(old["threshold"])
-            map_out = Detector(*_model(old, "signals"), threshold, str(old["note"]))
+            map_out = _detector(old, "signals")
         now, final = _risk(tree["now"], "signals"), _risk(tree["final"], "delayed")
     except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise InputError(f"{where}: is not a calibration file ({error}); {fix}") from error
@@ -253,6 +256,6 @@ def first_look() -> First:
     text = resources.files("taojax").joinpath(FIRST_LOOK).read_text(encoding="utf-8")
     tree = tomllib.loads(text)
     return First(*(
-        Detector(*_model(tree[kind], spec), float(tree[kind]["threshold"]), str(tree[kind]["note"]))
+        _detector(tree[kind], spec)
         for kind, spec in (("now", "signals"), ("final", "delayed"))
     ))  # fmt: skip

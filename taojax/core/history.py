@@ -47,18 +47,18 @@ class History(eqx.Module):
     """0 where nothing is held."""
 
     way_gaps: Float[Array, " h"]
-    """Way from each to the newest frame."""
-
-    since_gaps: Float[Array, ""]
-    """Way since one was last held."""
+    """Way from each to the newest frame; of the last one, way since any was held."""
 
 
 def no_history() -> History:
     """Return the history before the first frame."""
-    return History(
-        jnp.zeros((HELD, 3)), jnp.zeros((HELD, 3)), jnp.zeros(HELD), jnp.zeros(HELD),
-        jnp.asarray(HELD_EVERY),
-    )  # fmt: skip
+    nowhere = jnp.zeros((HELD, 3))
+    return History(nowhere, nowhere, jnp.zeros(HELD), jnp.full(HELD, HELD_EVERY))
+
+
+def push(rows: Array, newest: Array) -> Array:
+    """Drop the oldest row and add the newest one."""
+    return jnp.concatenate([rows[1:], newest[None]])
 
 
 def first_trust(first: FirstLook, features: Float[Array, " f"]) -> Float[Array, ""]:
@@ -96,7 +96,7 @@ def contradiction(
     driven = jnp.sqrt(motion[0] ** 2 + motion[1] ** 2) / gap_m
     back = jnp.broadcast_to(inverse(motion), history.local.shape)
     local = compose(back, history.local)
-    way, since = history.way_gaps + driven, history.since_gaps + driven
+    way = history.way_gaps + driven
 
     # Carried on, not back: so the headings of the trusted answers count, not the doubtful one's,
     # which fits a mirrored corridor.
@@ -109,10 +109,11 @@ def contradiction(
     against = jnp.sum(jnp.where(is_near, 0.0, weight))
 
     held = trust * (1.0 + agree) / (1.0 + agree + against)
-    is_due = since >= HELD_EVERY
-    push = lambda rows, new: jnp.where(is_due, jnp.concatenate([rows[1:], new[None]]), rows)
     after = History(
         push(local, jnp.zeros(3)), push(history.answers, pose), push(history.trust, held),
-        push(way, jnp.zeros(())), jnp.where(is_due, 0.0, since),
+        push(way, jnp.zeros(())),
     )  # fmt: skip
+    kept = History(local, history.answers, history.trust, way)
+    is_due = way[-1] >= HELD_EVERY
+    after = jax.tree.map(lambda new, old: jnp.where(is_due, new, old), after, kept)
     return after, jnp.log1p(against) - jnp.log1p(agree)

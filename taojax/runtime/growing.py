@@ -257,7 +257,7 @@ def replay_growing(
         parts.append(_replayed(config, padded(tables), log, rows, WARM + BLOCK))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     # A block's own replay knows its warm-up alone; the past is the whole drive's.
-    still = np.where(np.isfinite(odometry).all(axis=1, keepdims=True), odometry, 0.0)
+    still = hindsight.clean(tables, odometry, *lists).odometry
     now, final = (
         hindsight.recall_log(config.verdict, first, joined.gap_m, still, answers)
         for first, answers in zip(first_look(), joined.both, strict=True)

@@ -34,6 +34,7 @@ from taojax.core.history import (
     contradiction,
     first_trust,
     no_history,
+    push,
 )
 from taojax.core.path import Support, Window, support
 from taojax.core.se2 import between, compose, inverse, transform
@@ -202,10 +203,6 @@ def _own(places: Places, pose: Array, index: Array) -> Array:
     return jnp.where(index[0] >= 0, jnp.minimum(away, FARTHEST), FARTHEST)
 
 
-def _push(window: Array, newest: Array) -> Array:
-    return jnp.concatenate([window[1:], newest[None]])
-
-
 @jax.jit
 def advance(
     config: VerdictConfig, tables: MapTables, state: State, seen: Seen
@@ -227,13 +224,13 @@ def advance(
     driven = jnp.sqrt(seen.odometry[0] ** 2 + seen.odometry[1] ** 2) / places.gap_m
     index, scaled = seen.index[:LISTED], seen.scaled[:LISTED]
     back = inverse(seen.odometry)
-    poses = _push(compose(jnp.broadcast_to(back, state.past.odometry.shape), state.past.odometry),
+    poses = push(compose(jnp.broadcast_to(back, state.past.odometry.shape), state.past.odometry),
                   jnp.zeros(3))  # fmt: skip
-    pace = _push(state.pace, frame_pace(places, seen.odometry))
-    weights = _push(state.weight, weight)
-    past = Seen(poses, _push(state.past.index, index), _push(state.past.scaled, scaled))
-    answers = _push(state.answers, reading.pose)
-    way = _push(state.way_gaps + driven, jnp.zeros(()))
+    pace = push(state.pace, frame_pace(places, seen.odometry))
+    weights = push(state.weight, weight)
+    past = Seen(poses, push(state.past.index, index), push(state.past.scaled, scaled))
+    answers = push(state.answers, reading.pose)
+    way = push(state.way_gaps + driven, jnp.zeros(()))
     # Frames between each and the newest: the paces of those that follow it.
     paces = pace - jnp.flip(jnp.cumsum(jnp.flip(pace)))
     window = Window(poses[:, :2], way, past.index, past.scaled, weights)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import StreamConfig
 from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
+from taojax.core.history import push
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
 from taojax.core.sums import least, over_frames
@@ -147,10 +148,6 @@ def memory_step(
     return Memory(joint, belief), reading, terms
 
 
-def _push(window: Array, newest: Array) -> Array:
-    return jnp.concatenate([window[1:], newest[None]])
-
-
 def _own_weight(frame: Frame, like: Array) -> Array:
     if frame.weight is None:
         return jnp.ones((), like.dtype)
@@ -222,11 +219,11 @@ def step(
     odometry, index, similarity = clean(config, tables, frame)
     is_there = index >= 0
     anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
-    p = _push(transform(inverse(odometry)[None], state.p), jnp.zeros(2))
-    q, s = _push(state.q, anchors.T), _push(state.similarity, similarity)
-    has_anchor = _push(state.has_anchor, is_there)
-    is_filled = _push(state.is_filled, jnp.ones((), bool))
-    given = _push(state.weight, _own_weight(frame, p))
+    p = push(transform(inverse(odometry)[None], state.p), jnp.zeros(2))
+    q, s = push(state.q, anchors.T), push(state.similarity, similarity)
+    has_anchor = push(state.has_anchor, is_there)
+    is_filled = push(state.is_filled, jnp.ones((), bool))
+    given = push(state.weight, _own_weight(frame, p))
     weight = window_weight(given, is_filled)
 
     params = cost_params(config, tables)
@@ -239,7 +236,7 @@ def step(
     shape = diagnose(p, q[:, :, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
 
     n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *signals.WINDOWS))
-    history = _push(state.top1, signals.top1(similarity))
+    history = push(state.top1, signals.top1(similarity))
     previous = state.q[-1, :, 0]
     had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
     means = signals.windowed(history, n_seen)

@@ -64,7 +64,8 @@ def run(args: Closures) -> None:
     vertices = f"vertices 0 to {n_map - 1} are the map, {n_map} to {n_map + n_query - 1} the query"
     if graph.is_own:
         vertices = f"vertices 0 to {n_query - 1} are the drive's"
-    print(f"verdicts of {verdicts.source} on {n_frames} frames; {vertices} frames")
+    again = "" if args.max_wrong is None else ", decided again,"
+    print(f"verdicts of {verdicts.source}{again} on {n_frames} frames; {vertices} frames")
     print(f"closures.g2o    {n['accept']} accepted closures")
     print(f"rejected.g2o    {n['reject']} rejected ones, to look at")
     print(f"left out        {n['abstain']} on which nothing was decided, "
@@ -85,7 +86,7 @@ def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
         return None
     labels = read_frames(run / "labels.csv", "labels", len(verdicts.verdict))
     accepted, where = verdicts.verdict == "accept", "all frames"
-    if verdicts.source.startswith("verdicts.csv"):
+    if verdicts.source == "verdicts.csv":
         # Its numbers were fitted on the other half of the same run.
         accepted, where = accepted & (labels["split"] == "test"), "the test half"
     n, n_off = int(accepted.sum()), int((accepted & (labels["label"] == "map_out")).sum())
