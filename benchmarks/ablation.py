@@ -1,17 +1,14 @@
 """What each ingredient is worth: one is taken away at a time, everything else stays.
 
-Settings are changed through the configuration; ingredients that are no setting are swapped in the
-module that owns them and put back. Signals of one replay (adaptive memory against a fading window,
-parts of the fused probability) come from its own columns.
+Settings of the filter are changed through the configuration, parts of `tao` are columns of one
+replay, and features of the verdict lose their weight in the shipped numbers.
 """
 
-import contextlib
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -19,28 +16,26 @@ from matplotlib.figure import Figure
 from benchmarks.entrants import Field, field_of, stream
 from benchmarks.pictures import save
 from benchmarks.sets import DataSet, recipes
-from taojax import detector
-from taojax.audit import calibration, metrics
+from taojax.audit import metrics, risk
 from taojax.audit.figures import csv_text
-from taojax.config import AuditConfig, Config, StreamConfig
-from taojax.core import association
+from taojax.config import AuditConfig, Config, VerdictConfig
 from taojax.plots import IN_MAP, MAP_OUT, PALE
-from taojax.runtime import joint
-from taojax.runtime.maps import map_tables
+from taojax.risk import probability_wrong, shipped
+from taojax.runtime import hindsight
 from taojax.specs import write_atomically
 
 NAN = float("nan")
 
-DETECTOR, FITTED = "tao: ", "probability, test half: "
-"""Beginnings of a variant's name: the detector over all frames, the model on its test half."""
+DETECTOR, VERDICT = "tao: ", "final verdict: "
+"""Beginnings of a variant's name: the off-map signal, and the probability of being wrong."""
 
-WHOLE = {DETECTOR: "all ingredients", FITTED: "all parts"}
+WHOLE = {DETECTOR: "all ingredients", VERDICT: "all features"}
 """What the variants of each group are held against."""
 
 PANELS = (
     ("AUROC of tao, all frames", DETECTOR, "auroc"),
     ("FAR at 95 % of tao, all frames", DETECTOR, "far_at_95"),
-    ("AUROC of the probability, test half", FITTED, "auroc"),
+    ("AUROC of wrong answers, all frames", VERDICT, "auroc"),
 )
 """Rows of the figure: title, group of variants, figure of a cell."""
 
@@ -52,47 +47,30 @@ EVEN = 0.005
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "all ingredients": {},
-    "rank instead of joint": {"association": "rank"},
-    "half the seeds": {"joint_seeds": 8},
-    "twice the seeds": {"joint_seeds": 30},
-    "short window (20)": {"joint_window": 20, "memory_frames": 7.0},
-    "no heading prior": {"kappa_spacings": 0.0},
-    "half delta": {"delta_spacings": 1.5},
-    "twice delta": {"delta_spacings": 6.0},
+    "half the evidence": {"evidence": 2.0},
+    "twice the evidence": {"evidence": 8.0},
+    "leaves the map four times as often": {"leave": 0.08},
+    "comes back a third as often": {"come_back": 0.033},
+    "half the tolerance": {"near_gaps": 1.0},
+    "twice the tolerance": {"near_gaps": 4.0},
 }
 
-
-def _one_direction(*args: Any) -> jax.Array:
-    seeds = _SEEDS(*args)
-    n = (len(seeds) - 2) // 2
-    # The reversed half repeats the forward half, so that every shape stays.
-    return seeds.at[n : 2 * n].set(seeds[:n])
-
-
-def _nothing_carried(*args: Any) -> jax.Array:
-    seeds = _SEEDS(*args)
-    return seeds.at[-2:].set(seeds[0])
-
-
-_SEEDS = joint.seeds_of
-SWAPS: dict[str, tuple[Any, str, Any]] = {
-    "one travel direction": (joint, "seeds_of", _one_direction),
-    "no carried branch": (joint, "seeds_of", _nothing_carried),
-    "two alternations": (association, "ROUNDS", 2),
-    "no re-fit": (association, "ROUNDS", 0),
+COLUMNS = {
+    "the literal cost instead": "tao_rank",
+    "cost along the path alone": "cost_long",
+    "doubt of the place alone": "place",
 }
+"""Variant -> what stands in for the sum."""
 
-
-@contextlib.contextmanager
-def _swapped(module: Any, name: str, value: Any) -> Iterator[None]:
-    kept = getattr(module, name)
-    setattr(module, name, value)
-    jax.clear_caches()
-    try:
-        yield
-    finally:
-        setattr(module, name, kept)
-        jax.clear_caches()
+FEATURES = {
+    "belief": ("place", "off_map", "elsewhere", "reverse", "rival"),
+    "similarity level": ("level_short", "level", "level_long"),
+    "cost along the path": ("cost_short", "cost", "cost_long"),
+    "vote": ("vote_short", "vote", "vote_long", "listed", "agree"),
+    "own candidate": ("own",),
+    "contradiction": ("contradiction",),
+}
+"""Group -> features of the final answer."""
 
 
 class Cell(NamedTuple):
@@ -117,41 +95,33 @@ def _cell(signal: np.ndarray, field: Field) -> Cell:
     return Cell(metrics.auroc(values, is_out), metrics.far_at_95(values, is_out))
 
 
-def _test_cell(columns: dict[str, np.ndarray], field: Field, recall: float) -> Cell:
-    splits = field.split(columns)
-    model = calibration.fit(splits.calibration, recall)
-    known = splits.test.is_in | splits.test.is_out
-    p = detector.probability(model, splits.test.signals)[known]
-    return Cell(metrics.auroc(p, splits.test.is_out[known]))
-
-
-def _columns(data: DataSet, config: StreamConfig) -> dict[str, np.ndarray]:
-    records = stream(data, config)[0]
-    return {name: np.asarray(values, float) for name, values in records.signals.items()}
+def _wrong_cell(delayed: Mapping[str, np.ndarray], own: risk.Own, without: tuple[str, ...]) -> Cell:
+    numbers = shipped().final
+    weight = np.where(np.isin(numbers.columns, without), 0.0, numbers.weight)
+    p = probability_wrong(numbers._replace(weight=weight), delayed)
+    known = own.is_right | own.is_wrong
+    return Cell(metrics.auroc(p[known], own.is_wrong[known]))
 
 
 def _rows(data: DataSet) -> dict[str, Cell]:
     """Return variant -> cell for one set."""
     audit = AuditConfig(r_in_m=data.r_in_m, r_out_m=data.r_out_m)
-    field = field_of(data, Config(audit=audit))
-    full, rows = _columns(data, StreamConfig()), {}
-    recall = float(map_tables(data.map_poses, None, data.map_descriptors).recall)
+    field, rows = field_of(data, Config(audit=audit)), {}
+    full = stream(data, Config())
     for name, settings in SETTINGS.items():
-        columns = full if not settings else _columns(data, StreamConfig(**settings))
-        rows[f"{DETECTOR}{name}"] = _cell(columns["tao"], field)
-    rows[f"{DETECTOR}without the recursive filter"] = _cell(full["tao_align"], field)
-    rows[f"{DETECTOR}without it, fading window instead of adaptive memory"] = _cell(
-        full["tao_window"], field
-    )
-    for name, swap in SWAPS.items():
-        with _swapped(*swap):
-            rows[f"{DETECTOR}{name}"] = _cell(_columns(data, StreamConfig())["tao"], field)
-    rows[f"{FITTED}all parts"] = _test_cell(full, field, recall)
-    rows[f"{FITTED}prior of an unknown map"] = _test_cell(full, field, calibration.LIST_RECALL)
-    for name in calibration.DISTINCT:
-        # A constant column says nothing: the part is gone, the fit is the same.
-        without = full | {name: np.zeros_like(full[name])}
-        rows[f"{FITTED}without {name}"] = _test_cell(without, field, recall)
+        run = full if not settings else stream(data, Config(verdict=VerdictConfig(**settings)))
+        rows[f"{DETECTOR}{name}"] = _cell(np.asarray(run.records.signals["tao"], float), field)
+    now = hindsight.now_columns(full.both.now)
+    for name, column in COLUMNS.items():
+        values = now.get(f"now_{column}", full.records.signals.get(column))
+        rows[f"{DETECTOR}{name}"] = _cell(np.asarray(values, float), field)
+    final = full.both.final
+    error = np.hypot(*(final.pose[:, :2] - data.truth_m).T)
+    own = risk.own_answers(error, field.nearest_m, audit.wrong_m, audit.r_out_m)
+    delayed = hindsight.delayed_columns(final)
+    rows[f"{VERDICT}all features"] = _wrong_cell(delayed, own, ())
+    for name, features in FEATURES.items():
+        rows[f"{VERDICT}without {name}"] = _wrong_cell(delayed, own, features)
     return rows
 
 
@@ -165,7 +135,7 @@ def to_markdown(table: Table) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """Return one row per variant and set; FAR is blank for the probability."""
+    """Return one row per variant and set; FAR is blank for the verdict."""
     rows = [(v, name, *cell) for v, cells in table.items() for name, cell in cells.items()]
     columns = zip(("variant", "set", *Cell._fields), zip(*rows, strict=True), strict=True)
     # Names hold commas.

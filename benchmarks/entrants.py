@@ -13,8 +13,7 @@ from benchmarks.sets import DataSet
 from taojax import detector
 from taojax.audit import calibration, labels, risk, sequential
 from taojax.baselines.frames import Frames
-from taojax.config import Config, StreamConfig
-from taojax.core.adaptive import adaptive_mean
+from taojax.config import Config
 from taojax.risk import for_run, probability_wrong, shipped
 from taojax.runtime import hindsight
 from taojax.runtime.frames import Frame, StreamRecord
@@ -22,8 +21,9 @@ from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.rivals import SYSTEMS
 from taojax.runtime.scale import LEAST_RANGE
 from taojax.runtime.score import replay_log
+from taojax.runtime.stream import answered
 
-OURS = ("tao", "tao_align", "recursive", "tao_rank")
+OURS = ("tao", "tao_rank")
 """Columns of our stream that compete."""
 
 FUSED = "probability_map_out"
@@ -99,14 +99,30 @@ def _timed(function: Callable[[], object], n_frames: int) -> float:
     return (time.perf_counter() - start) / n_frames * 1e6
 
 
-def stream(data: DataSet, config: StreamConfig) -> tuple[StreamRecord, MapTables, float]:
-    """Replay a set; returns the records, the tables and us/frame without compilation."""
-    tables = map_tables(data.map_poses, config, data.map_descriptors)
+class Played(NamedTuple):
+    """A set, replayed."""
+
+    records: StreamRecord
+    tables: MapTables
+    both: hindsight.Both
+    us: float
+    """Per frame of the literal stream, without compilation."""
+
+    both_us: float
+    """Per frame of the answers, now and finally."""
+
+
+def stream(data: DataSet, config: Config) -> Played:
+    """Replay a set."""
+    tables = map_tables(data.map_poses, None, data.map_descriptors)
     frames = Frame(*(jnp.asarray(a) for a in (data.odometry, data.index, data.similarity)))
-    whole = Config(stream=config)
-    records = replay_log(whole, tables, frames)
+    records = replay_log(config, tables, frames)
     some = jax.tree.map(lambda leaf: leaf[:256], frames)
-    return records, tables, _timed(lambda: replay_log(whole, tables, some), len(some.odometry))
+    us = _timed(lambda: replay_log(config, tables, some), len(some.odometry))
+    seen = hindsight.clean(tables, data.odometry, data.index, data.similarity)
+    both = hindsight.replay_both(config.verdict, tables, seen)
+    both_us = _timed(lambda: hindsight.replay_both(config.verdict, tables, seen), len(data.index))
+    return Played(answered(config, records, both.now), tables, both, us, both_us)
 
 
 def rivals(data: DataSet, wanted: Callable[[str], bool]) -> list[Entry]:
@@ -144,11 +160,12 @@ def similarity_filters(top1: np.ndarray, field: Field, place: np.ndarray) -> lis
     return [*found, Entry("sequential test", "rival", test, place, us)]
 
 
-def oracle_alignment(data: DataSet, config: StreamConfig, tables: MapTables) -> np.ndarray:
-    """Return the joint cost at the true alignment, whatever its branches found.
+def oracle_alignment(data: DataSet, config: Config, tables: MapTables) -> np.ndarray:
+    """Return the cost along the true path, whatever the filter believed.
 
-    In every frame of the window the best anchor about the true place is taken: truncated Huber
-    cost of its distance plus 1 - similarity on the fixed scale, with the memory of `tao_align`.
+    In every frame the best anchor about the true place is taken: truncated Huber cost of its
+    distance plus 1 - similarity on the fixed scale, averaged over as many frames as `tao` looks
+    back.
     """
     n_map = len(data.map_poses)
     low, high = np.asarray(tables.scale, float)
@@ -156,17 +173,15 @@ def oracle_alignment(data: DataSet, config: StreamConfig, tables: MapTables) -> 
     rows = np.zeros((len(data.index), n_map + 1))
     # Number -1, no candidate, is the spare column; anchors that no list names count as background.
     np.put_along_axis(rows, np.where(data.index >= 0, data.index, n_map), scaled, axis=1)
-    delta = float(config.delta_spacings) * float(tables.spacing_m)
+    tolerance = float(config.verdict.near_gaps * tables.places.gap_m)
     gap = data.seen_m[:, None] - data.map_poses[None, :, :2]
-    r = np.hypot(gap[..., 0], gap[..., 1]) / delta
+    r = np.hypot(gap[..., 0], gap[..., 1]) / tolerance
     residual = np.where(r <= 1.0, 0.5 * r**2, r - 0.5)
-    cost = np.minimum(1.0, (residual + 1.0 - rows[:, :n_map]).min(axis=1))
-    n = config.joint_window
-    padded = np.concatenate([np.zeros(n - 1), cost])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, n)[:, ::-1]
-    is_filled = np.arange(n)[None] <= np.arange(len(cost))[:, None]
-    means = jax.vmap(adaptive_mean)(jnp.asarray(windows, jnp.float32), jnp.asarray(is_filled))
-    return np.asarray(means, float)
+    cost = np.minimum(1.0, 0.5 * (residual + 1.0 - rows[:, :n_map]).min(axis=1))
+    n = hindsight.LONG_PAST * config.verdict.window_frames
+    total, at = np.cumsum(np.append(0.0, cost)), np.arange(len(cost))
+    first = np.maximum(at - n, 0)
+    return (total[at + 1] - total[first]) / (at + 1 - first)
 
 
 def oracle_levels(top1: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -183,33 +198,33 @@ def oracle_levels(top1: np.ndarray, label: np.ndarray) -> np.ndarray:
     return log_odds(sequential.sticky_filter(ratio[place]))
 
 
-def _ours(data: DataSet, field: Field, run: tuple[StreamRecord, MapTables, float]) -> list[Entry]:
-    """Read our columns and fit the fused probability on the calibration half."""
-    records, _, us = run
+def _ours(field: Field, run: Played) -> list[Entry]:
+    """Read our columns and fit the probability of being off the map on the calibration half."""
+    records = run.records
     columns = {name: np.asarray(values, float) for name, values in records.signals.items()}
     place = np.where(records.has_pose[:, None], records.pose[:, :2].astype(float), np.nan)
     found = [
-        Entry(name, "ours", columns[name], None if name == "tao_rank" else place, us)
+        Entry(name, "ours", columns[name], None if name == "tao_rank" else place, run.us)
         for name in OURS
     ]
-    model = calibration.fit(field.split(columns).calibration, float(run[1].recall))
-    probability = detector.probability(model, columns)
-    more = _timed(lambda: detector.probability(model, columns), len(data.odometry))
-    return [*found, Entry(FUSED, "ours", log_odds(probability), place, us + more)]
+    delayed = hindsight.delayed_columns(run.both.final)
+    base = shipped().map_out
+    features = {name: delayed[name] for name in base.columns}
+    model = calibration.fit(field.split(features).calibration, base)
+    believed = run.both.final.pose[:, :2].astype(float)
+    probability = log_odds(detector.probability(model, delayed))
+    return [*found, Entry(FUSED, "ours", probability, believed, run.both_us)]
 
 
 def _verdicts(
-    data: DataSet, field: Field, config: Config, tables: MapTables
+    data: DataSet, field: Field, config: Config, run: Played
 ) -> tuple[list[Entry], Entry]:
     """Answer now and a lag later, the risk refined on the calibration half; and a two-sided rival.
 
     Returns:
         Our two entries, and the mean of top-1 over as many frames on both sides.
     """
-    seen = hindsight.clean(tables, data.odometry, data.index, data.similarity)
-    both = hindsight.replay_both(config.verdict, tables, seen)
-    us = _timed(lambda: hindsight.replay_both(config.verdict, tables, seen), len(data.odometry))
-    audit = config.audit
+    both, audit = run.both, config.audit
     found = []
     for kind, answer, columns in (
         ("now", both.now, hindsight.now_columns(both.now)),
@@ -222,7 +237,7 @@ def _verdicts(
         own = risk.own_answers(error, field.nearest_m, audit.wrong_m, audit.r_out_m)
         cut = risk.Own(own.is_right[half.frame], own.is_wrong[half.frame])
         p = probability_wrong(risk.refine(base, half, cut, audit.max_wrong), columns)
-        found.append(Entry(f"verdict, {kind}", "ours", log_odds(p), place, us))
+        found.append(Entry(f"verdict, {kind}", "ours", log_odds(p), place, run.both_us))
     top1 = 1.0 - np.where(data.index[:, 0] >= 0, data.similarity[:, 0], 0.0).astype(float)
     lag, total = config.verdict.lag, np.cumsum(np.append(0.0, top1))
     low = np.maximum(np.arange(len(top1)) - lag, 0)
@@ -252,23 +267,22 @@ def compete(
         return not (quick and name in SLOW) if names is None else name in names
 
     field = field_of(data, config)
-    run = stream(data, config.stream)
-    top1 = np.asarray(run[0].signals["top1"], float)
+    run = stream(data, config)
+    signals = run.records.signals
+    top1 = np.asarray(signals["top1"], float)
     top = data.index[:, 0]
     answer = np.where(top[:, None] >= 0, data.map_poses[np.maximum(top, 0), :2], np.nan)
-    gates = [
-        Entry(name, "rival", np.asarray(run[0].signals[name], float), answer) for name in GATES
-    ]
+    gates = [Entry(name, "rival", np.asarray(signals[name], float), answer) for name in GATES]
     audit = replace(config.audit, r_in_m=data.r_in_m, r_out_m=data.r_out_m)
-    verdicts, two_sided = _verdicts(data, field, replace(config, audit=audit), run[1])
+    verdicts, two_sided = _verdicts(data, field, replace(config, audit=audit), run)
     entries = [
-        *_ours(data, field, run),
+        *_ours(field, run),
         *verdicts,
         *gates,
         two_sided,
         *similarity_filters(top1, field, answer),
         *rivals(data, wanted),
-        Entry(ORACLES[0], "oracle", oracle_alignment(data, config.stream, run[1])),
+        Entry(ORACLES[0], "oracle", oracle_alignment(data, config, run.tables)),
         Entry(ORACLES[1], "oracle", oracle_levels(top1, field.label)),
     ]
     return field, [entry for entry in entries if wanted(entry.name)]

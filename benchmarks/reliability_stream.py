@@ -14,15 +14,12 @@ from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.stream import StreamState, init, replay, step
 
 CHUNK = 1000
-REMEMBERS = (
-    "tao", "tao_geom", "tao_vel", "tao_sim", "tao_align", "tao_window", "tao_rival", "recursive",
-    "support", "stale",
-)  # fmt: skip
-"""Signals of the joint association, whose memory has no end; the others see the window alone."""
+REMEMBERS = ("tao",)
+"""Signals of the filter, whose memory has no end; the others see the window alone."""
 
 CONFIGS = {
     "rank": StreamConfig(window=8, branches=6, association="rank"),
-    "joint": StreamConfig(window=8, branches=6, joint_window=8, joint_seeds=4),
+    "joint": StreamConfig(window=8, branches=6),
 }
 
 

@@ -123,7 +123,7 @@ def _settings(folder: Path) -> None:
     from taojax.risk import to_toml as calibration_toml
 
     (folder / "config.toml").write_text(to_toml(Config()))
-    (folder / "grid.toml").write_text("lambda_velocity = [0.1, 1]\n[joint]\nmemory_frames = [10]\n")
+    (folder / "grid.toml").write_text("lambda_velocity = [0.1, 1]\n[joint]\nevidence = [2]\n")
     (folder / "calibration.toml").write_text(calibration_toml(shipped()))
 
 
@@ -133,7 +133,7 @@ def _read_settings(folder: Path, out: Path) -> list[np.ndarray]:
     from taojax.runtime.grid import expand, read_grid
 
     config = from_toml(folder / "config.toml")
-    rows = expand(read_grid(folder / "grid.toml"), config.stream)
+    rows = expand(read_grid(folder / "grid.toml"), config)
     final = calibration_of(folder / "calibration.toml").final
     numbers = [float(v) for row in rows for v in row.values() if not isinstance(v, str)]
     return [np.array(numbers), final.mean, final.scale, final.weight]

@@ -3,26 +3,24 @@
 What limits the speed on a CPU (2 cores, XLA of jaxlib 0.10, one run; ratios in the README):
 
 * A single call. XLA keeps books on every buffer of a compiled function in every call, also on
-  those inside the little programs of its reductions: a joint step held 631 of them in 180 sums and
-  minima and spent half of its time there. Sums as matrix products, minima without argmin and moved
-  branches left 160: 1,140 -> 830 us. What remains is Python (60 us), handing memory out and back,
-  and threads that wake each other.
+  those inside the little programs of its reductions. Sums as matrix products, minima without
+  argmin and moved branches took a quarter off. What remains is Python (60 us), handing memory out
+  and back, and threads that wake each other.
 * A frame of the literal cost. With the branches in front (`vmap`), sums run over the innermost axis
   and XLA emits scalar loops; with the branches innermost, elementwise kernels take .3 to .7 us
   instead of 2 to 4, and sums by matrix product 1.4: 120 -> 45 us alone, 144 -> 84 us in a replay.
   Several sums that feed one expression are fused into one scalar loop whatever their layout, and
   an optimisation barrier between them is removed before fusion. 300 branches cost 184 us, 1,000
   cost 518; under `vmap` it was 520 for 300.
-* The largest kernels of a joint frame: spreading the recursive belief over 12 neighbours (48,000
-  gathers and 24,000 exponentials, .09 ms), the look-up behind it (24,000 gathers), pooling a list
-  over the map (24,000 gathers, .07 ms).
+* The largest kernels of a frame with the filter: spreading the belief over 12 neighbours (48,000
+  gathers and 24,000 exponentials, .09 ms) and the look-up behind it (24,000 gathers).
 
 What did not help: one thread instead of two, no asynchronous dispatch, donated state, state packed
 into one array, the step inside a loop of one turn, tuned malloc thresholds, wider vectors, fast
 mathematics; several frames of a replay under one vmap; a conditional between sums, so that each
 keeps its own kernel (120 -> 57 us, and a stall on a GPU); moments stacked into one product (the
-copies cost what the sums did); in the recursive filter matrix products instead of sums over 4,000
-numbers (50 us slower).
+copies cost what the sums did); in the filter matrix products instead of sums over 4,000 numbers
+(50 us slower).
 
 What did: one array for all signals, coordinates gathered one by one, lists and bytes in the rings,
 map and settings closed over instead of handed in.
@@ -82,10 +80,10 @@ def _replayed(drive: bench.Drive, config: StreamConfig, repeats: int) -> float:
 
 
 def over_branches(drive: bench.Drive, most: int, repeats: int) -> dict[str, Curve]:
-    """Return us per frame over K: rank branches, and seeds of the joint association."""
+    """Return us per frame over K: rank branches, and the filter beside them."""
     sizes = [k for k in (10, 30, 100, 300, 1000, 3000, 10_000) if k <= most]
     rank = lambda k: StreamConfig(association="rank", branches=k)
-    joint = lambda k: StreamConfig(branches=k, joint_seeds=k)
+    joint = lambda k: StreamConfig(branches=k)
     return {
         "rank over K": [(k, _replayed(drive, rank(k), repeats)) for k in sizes],
         "joint over K": [(k, _replayed(drive, joint(k), repeats)) for k in sizes if k <= 3000],
@@ -96,11 +94,7 @@ def over_window(drive: bench.Drive, most: int, repeats: int) -> dict[str, Curve]
     """Return us per frame over N."""
     sizes = [n for n in (5, 10, 20, 50, 100, 200) if n <= most]
     rank = lambda n: StreamConfig(association="rank", window=n)
-    joint = lambda n: StreamConfig(joint_window=n)
-    return {
-        "rank over N": [(n, _replayed(drive, rank(n), repeats)) for n in sizes],
-        "joint over N": [(n, _replayed(drive, joint(n), repeats)) for n in sizes],
-    }
+    return {"rank over N": [(n, _replayed(drive, rank(n), repeats)) for n in sizes]}
 
 
 def _streamed(config: StreamConfig, drive: bench.Drive, n_frames: int) -> float:
@@ -147,7 +141,7 @@ def over_tree(drive: bench.Drive, n_frames: int) -> dict[str, Curve]:
         ]
         for name, params in forms.items()
     }
-    ours = float(2 * StreamConfig().joint_seeds + 2)
+    ours = float(StreamConfig().branches)
     curves["tao hypotheses over t"] = [(t + 1, ours) for t in range(n_frames)]
     return curves
 

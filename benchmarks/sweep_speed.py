@@ -19,14 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taojax.config import StreamConfig
+from taojax.config import Config, VerdictConfig
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world
 from taojax.runtime.frames import Frame
 from taojax.runtime.grid import DEFAULT, Grid, Row, expand
 from taojax.runtime.maps import map_tables
 from taojax.runtime.retrieval import retrieve
-from taojax.runtime.sweep import JointUnit, at_once, evaluate, plan
+from taojax.runtime.sweep import at_once, evaluate, plan
 
 BATCHES = (1, 4, 16)
 """Units under one vmap; 1 is the loop."""
@@ -49,19 +49,19 @@ class Recording:
         world = scenario(make_world(WorldConfig(), 0), "default")
         index, similarity = retrieve(world.map_descriptors, world.query_descriptors)
         self.poses = world.map_poses[:, 1:]
-        self.tables = map_tables(self.poses, StreamConfig(), world.map_descriptors)
+        self.tables = map_tables(self.poses, None, world.map_descriptors)
         odometry = world.odometry[:, 1:].astype(np.float32)
         self.frames = Frame(*(jnp.asarray(a) for a in (odometry, index, similarity)))
 
     def work(self, rows: list[Row]) -> list:
-        return plan(rows, StreamConfig(), self.tables, self.frames)
+        return plan(rows, Config(), self.tables, self.frames)
 
 
 def compare(recording: Recording, say: Callable[[str], None]) -> list[dict[str, object]]:
     """Time the same units in a loop and under vmap, compilation apart."""
     found = []
-    for signals, units in recording.work(expand(DEFAULT, StreamConfig())):
-        name = "joint" if isinstance(units[0].arguments, JointUnit) else "rank"
+    for signals, units in recording.work(expand(DEFAULT, Config())):
+        name = "joint" if isinstance(units[0].arguments, VerdictConfig) else "rank"
         for batch in BATCHES:
             part = units[: max(batch, 4)]
             run = jax.jit(jax.vmap(signals) if batch > 1 else signals)
@@ -86,7 +86,7 @@ def compare(recording: Recording, say: Callable[[str], None]) -> list[dict[str, 
 
 def whole(recording: Recording, name: str, grid: Grid, say: Callable[[str], None]) -> None:
     """Time a sweep from a bare recording to the last signal, compilation included."""
-    rows, backend = expand(grid, StreamConfig()), jax.default_backend()
+    rows, backend = expand(grid, Config()), jax.default_backend()
     began, cpu, done = time.perf_counter(), time.process_time(), 0
     for signals, units in recording.work(rows):
         for members, _ in evaluate(

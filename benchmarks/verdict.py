@@ -66,6 +66,9 @@ class Judged(NamedTuple):
     """Columns of delayed.csv."""
 
     answers: judge.Answers
+    in_map: judge.Own
+    """Near the map, and off it, in the places of right and wrong: the paper's question."""
+
     odometry: Float[np.ndarray, "t 3"]
     gap_m: float
 
@@ -90,6 +93,7 @@ def answered(recording: Recording, config: VerdictConfig) -> Judged:
         hindsight.now_columns(both.now),
         hindsight.delayed_columns(both.final),
         judge.Answers(*own),
+        judge.Own(nearest <= audit.r_in_m, nearest > audit.r_out_m),
         seen.odometry,
         float(tables_.places.gap_m),
     )
@@ -109,7 +113,17 @@ def first_look(recordings: Sequence[Judged], kind: str) -> Detector:
     """Fit how far an answer is trusted before its past is asked, on pooled recordings."""
     risk = pooled(recordings, kind, "", columns_of(kind)[:-1])
     note = f"fitted on {len(recordings)} pooled recordings, without what the past says"
-    return Detector(risk.columns, risk.mean, risk.scale, risk.weight, risk.bias, risk.level, note)
+    return _as_detector(risk, risk.level, note)
+
+
+def _as_detector(risk: Risk, threshold: float, note: str) -> Detector:
+    return Detector(risk.columns, risk.mean, risk.scale, risk.weight, risk.bias, threshold, note)
+
+
+def map_out(recordings: Sequence[Judged]) -> Detector:
+    """Fit the paper's question, in the map or off it, on pooled recordings."""
+    risk = pooled(recordings, "final", "", of_map=True)
+    return _as_detector(risk, 0.5, f"fitted on {len(recordings)} pooled recordings")
 
 
 def recalled(config: VerdictConfig, one: Judged, first: Mapping[str, Detector]) -> Judged:
@@ -144,7 +158,12 @@ def recalled_apart(config: VerdictConfig, recordings: Sequence[Judged]) -> list[
 
 
 def pooled(
-    recordings: Sequence[Judged], kind: str, promise: str, names: Sequence[str] | None = None
+    recordings: Sequence[Judged],
+    kind: str,
+    promise: str,
+    names: Sequence[str] | None = None,
+    *,
+    of_map: bool = False,
 ) -> Risk:
     """Fit the log odds of being wrong on pooled recordings.
 
@@ -153,6 +172,7 @@ def pooled(
         kind: now or final.
         promise: what the numbers say of themselves.
         names: the features; all when omitted.
+        of_map: fit the log odds of being off the map instead.
     """
     names = columns_of(kind) if names is None else tuple(names)
     n_family = {one.family: 0.0 for one in recordings}
@@ -160,9 +180,8 @@ def pooled(
         n_family[one.family] += 1.0
     xs, ys, ws = [], [], []
     for one in recordings:
-        own = getattr(one.answers, kind)
         xs.append(_table(one, kind, names))
-        ys.append(own.is_wrong)
+        ys.append(one.in_map.is_wrong if of_map else getattr(one.answers, kind).is_wrong)
         ws.append(np.full(len(xs[-1]), 1.0 / len(xs[-1]) / np.sqrt(n_family[one.family])))
     x, y, w = np.concatenate(xs), np.concatenate(ys), np.concatenate(ws)
     w *= POOLED_WEIGHT / w.sum()
@@ -276,7 +295,7 @@ def default_calibration(recordings: Sequence[Judged], rows: Sequence[Mapping[str
             "were left out when these numbers were fitted; nothing was checked at this place"
         )
         found[kind] = at_most(pooled(recordings, kind, promise), 0.05)
-    return numbers.to_toml(Calibration(**found))
+    return numbers.to_toml(Calibration(**found, map_out=map_out(recordings)))
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

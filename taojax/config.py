@@ -34,8 +34,9 @@ class StreamConfig(eqx.Module):
     """*shape*. Hypotheses evaluated at once (the paper's K), at least 1."""
 
     association: str = eqx.field(static=True, default="joint")
-    """*shape*. What a branch of `tao` is, `rank` or `joint`. `rank` is the paper's literal reading
-    and is always there as `tao_rank`."""
+    """*shape*. What `tao` and the pose are of: `rank`, the paper's literal branches, which are
+    always there as `tao_rank`; `joint`, the filter's answer, whose path through the map associates
+    all frames at once."""
 
     lambda_velocity: Scalar = 1.0
     """Weight of the velocity term of Eq. 1, dimensionless, >= 0."""
@@ -48,8 +49,7 @@ class StreamConfig(eqx.Module):
     mask, >= 0: no support is as bad as support at the mask. Its similarity counts as 0."""
 
     delta_spacings: Scalar = 3.0
-    """Huber threshold as a multiple of the map's median spacing, > 0. A joint branch finds support
-    within 9 spacings of an anchor, so 6 is the largest that acts in full there."""
+    """Huber threshold as a multiple of the map's median spacing, > 0."""
 
     mask_deltas: Scalar = 3.0
     """Residual mask as a multiple of the Huber threshold, > 0."""
@@ -57,18 +57,6 @@ class StreamConfig(eqx.Module):
     refine: bool = eqx.field(static=True, default=False)
     """*shape*. Take Eq. 1 of rank branches at its true Huber minimum instead of the closed form:
     `tao_rank` and its terms change, and a frame takes about a millisecond longer."""
-
-    joint_window: int = eqx.field(static=True, default=60)
-    """*shape*. Frames that a joint branch remembers, at least 3; older ones weigh less anyway."""
-
-    joint_seeds: int = eqx.field(static=True, default=15)
-    """*shape*. Newest candidates that seed a joint branch, each in both travel directions."""
-
-    memory_frames: Scalar = 20.0
-    """Age at which a frame's weight in the joint cost has fallen to 1/e, frames, > 0."""
-
-    kappa_spacings: Scalar = 1.25
-    """Weight of the heading prior of a joint branch, in map spacings squared, >= 0."""
 
     entropy_temperature: Scalar = 0.05
     """Softmax temperature of the entropy signal, similarity units, > 0."""
@@ -82,12 +70,9 @@ class StreamConfig(eqx.Module):
         _check_range("branches", self.branches, 1, 1_000_001)
         if self.association not in ("rank", "joint"):
             raise ConfigError(f"association must be rank or joint, got {self.association!r}")
-        _check_range("joint_window", self.joint_window, 3, 10_001)
-        _check_range("joint_seeds", self.joint_seeds, 1, 1_000_001)
-        for name in ("lambda_velocity", "gamma_similarity", "tau_masks", "kappa_spacings"):
+        for name in ("lambda_velocity", "gamma_similarity", "tau_masks"):
             _check_range(name, getattr(self, name), 0.0)
-        positive = ("delta_spacings", "mask_deltas", "memory_frames", "entropy_temperature", "eps")
-        for name in positive:
+        for name in ("delta_spacings", "mask_deltas", "entropy_temperature", "eps"):
             _check_range(name, getattr(self, name), 1e-30)
 
 

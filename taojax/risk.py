@@ -22,7 +22,7 @@ from taojax.specs import column_names, read_text
 LARGEST_LOG_ODDS = 30.0
 """Keeps probabilities inside (0, 1) in float64."""
 
-SCHEMA = 2
+SCHEMA = 3
 """Of calibration.toml; files of 0.1.0 have none."""
 
 DEFAULT, FIRST_LOOK = "default_calibration.toml", "first_look.toml"
@@ -82,8 +82,8 @@ class Calibration(NamedTuple):
     final: Risk
     """Of answers a lag later."""
 
-    map_out: Detector | None = None
-    """Of being off the map, as in the paper's tables; None where nobody fitted it."""
+    map_out: Detector
+    """Of being off the map, as in the paper's tables."""
 
     fitted_on: MapFacts | None = None
     """None where it is the shipped one."""
@@ -164,9 +164,8 @@ def to_toml(calibration: Calibration) -> str:
         "",
         *_section("now", calibration.now),
         *_section("final", calibration.final),
+        *_section("map_out", calibration.map_out),
     ]
-    if calibration.map_out is not None:
-        lines += _section("map_out", calibration.map_out)
     if (facts := calibration.fitted_on) is not None:
         lines += [
             "[map]",
@@ -220,15 +219,14 @@ def _parse(text: str, where: str) -> Calibration:
             )
         if tree["schema"] != SCHEMA:
             raise ValueError(f"schema {tree['schema']}, this taojax reads {SCHEMA}")
-        facts, map_out = None, None
+        facts = None
         if (seen := tree.get("map")) is not None:
             facts = MapFacts(
                 str(seen["poses_sha256"]), str(seen["views_sha256"]),
                 float(seen["spacing_m"]), float(seen["recall"]),
             )  # fmt: skip
-        if (old := tree.get("map_out")) is not None:
-            map_out = _detector(old, "signals")
         now, final = _risk(tree["now"], "signals"), _risk(tree["final"], "delayed")
+        map_out = _detector(tree["map_out"], "delayed")
     except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise InputError(f"{where}: is not a calibration file ({error}); {fix}") from error
     return Calibration(now, final, map_out, facts)

@@ -12,7 +12,6 @@ STATUS_MEANS = {
     "warming_up": "fewer than three frames seen",
     "degenerate": "the window does not determine a pose",
     "no_candidates": "the frontend offered no place",
-    "lost": "the newest frames contradict the window and no branch is established again",
 }
 """Status -> what it says; no comma, because reasons stand in CSV cells."""
 
@@ -85,7 +84,6 @@ def decide(
     verdict, reason, p = judged(calibration.final, delayed, status)
     now, why_now, p_now = judged(calibration.now, signals, status)
     answered = lambda values: np.where(has, np.asarray(values, float), np.nan)
-    nobody = np.full(len(status), np.nan)
     return {
         "frame": signals["frame"],
         "verdict": verdict,
@@ -99,7 +97,5 @@ def decide(
         "x_now_m": answered(signals["now_x_m"]),
         "y_now_m": answered(signals["now_y_m"]),
         "theta_now_rad": answered(signals["now_theta_rad"]),
-        "probability_map_out": nobody
-        if calibration.map_out is None
-        else probability(calibration.map_out, signals),
+        "probability_map_out": probability(calibration.map_out, delayed),
     }

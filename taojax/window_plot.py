@@ -1,4 +1,4 @@
-"""The picture of one frame: its window on the map, and what disagrees."""
+"""The picture of one answer: its path on the map, and what disagrees."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,17 +22,17 @@ LETTER, LINE = 5.2, 10.0
 """Width of a letter and height of a line of a label, points."""
 
 REACH = (13.0, 20.0, 30.0, 42.0, 56.0)
-"""How far from its branch the middle of a label may stand, points."""
+"""How far from its place the middle of a label may stand, points."""
 
 CANDIDATE, BRANCH = CYCLE[4], CYCLE[2]
 
 
 class WindowMarks(NamedTuple):
-    """What is drawn; frames newest first."""
+    """What is drawn; frames in order."""
 
     map_m: Float[np.ndarray, "m 2"]
     path_m: Float[np.ndarray, "n 2"]
-    """Odometry on the cheapest branch."""
+    """Odometry, carried by the answer."""
 
     anchor_m: Float[np.ndarray, "n 2"]
     """Map position that each frame is paired with; NaN without one."""
@@ -41,10 +41,10 @@ class WindowMarks(NamedTuple):
     candidate_m: Float[np.ndarray, "c 2"]
     """Of the newest frame, best first."""
 
-    branch: Float[np.ndarray, "k 3"]
-    """Poses of the branches told of, cheapest first."""
+    place: Float[np.ndarray, "k 3"]
+    """The answer and other places."""
 
-    branch_cost: Float[np.ndarray, " k"]
+    place_cost: Float[np.ndarray, " k"]
 
 
 def _arrow(ax: Axes, pose: np.ndarray, length_m: float, colour: str) -> None:
@@ -103,10 +103,10 @@ def place_labels(
     return found
 
 
-def _label_branches(marks: WindowMarks, corner: np.ndarray, side_m: float, ax: Axes) -> None:
-    """Number the branches and write their costs."""
+def _label_places(marks: WindowMarks, corner: np.ndarray, side_m: float, ax: Axes) -> None:
+    """Number the places and write their costs."""
     points = lambda xy: (xy - corner) * AXES_POINTS / side_m
-    pose, cost = marks.branch, marks.branch_cost
+    pose, cost = marks.place, marks.place_cost
     ahead = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
     steps = ARROW * side_m * np.linspace(0.0, 1.1, 7)
     arrows = (pose[:, None, :2] + steps[None, :, None] * ahead[:, None]).reshape(-1, 2)
@@ -128,7 +128,7 @@ def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
 
     Args:
         marks: what to draw.
-        is_close: show the window alone; else the whole map with the branches and candidates.
+        is_close: show the window alone; else the whole map with the places and candidates.
         ax: where to draw.
     """
     agrees, path = marks.is_inlier, marks.path_m
@@ -138,7 +138,7 @@ def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
             *marks.candidate_m.T, s=16, facecolors="none", edgecolors=CANDIDATE, linewidths=0.9,
             marker="s", label=f"candidates of this frame ({len(marks.candidate_m)})", zorder=3,
         )  # fmt: skip
-    ax.plot(*path.T, color=INK, linewidth=0.9, zorder=4, label="odometry on the best branch")
+    ax.plot(*path.T, color=INK, linewidth=0.9, zorder=4, label="odometry, carried by the answer")
     if is_close:
         label = "from a frame to the map pose it is paired with"
         for at, to, good in zip(path, marks.anchor_m, agrees, strict=True):
@@ -158,19 +158,19 @@ def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
     (left, right), (low, high) = (
         _limits(path, marks.anchor_m)
         if is_close
-        else _limits(marks.map_m, path, marks.branch[:, :2])
+        else _limits(marks.map_m, path, marks.place[:, :2])
     )
-    for number, pose in enumerate(marks.branch):
+    for number, pose in enumerate(marks.place):
         if is_close and number:
             break
         label = (
-            "robot on each branch, with number and cost" if number == 0 and not is_close else None
+            "the answer (1) and other places, with costs" if number == 0 and not is_close else None
         )
         ax.scatter(*pose[:2], s=34, color=BRANCH, marker="D", edgecolors="white", linewidths=0.6,
                    label=label, zorder=8)  # fmt: skip
         _arrow(ax, pose, ARROW * (right - left), BRANCH)
     if not is_close:
-        _label_branches(marks, np.array([left, low]), right - left, ax)
+        _label_places(marks, np.array([left, low]), right - left, ax)
     ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(left, right), ylim=(low, high))
     ax.set_aspect("equal", adjustable="box")
     return ax

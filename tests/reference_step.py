@@ -1,15 +1,15 @@
-"""A stream in plain NumPy and float64, frame by frame: what every signal of a step has to be.
+"""The literal stream in plain NumPy and float64: what every signal of a step has to be.
 
-It shares no line with the library but the map's tables: nearest anchors, cells, neighbours.
+It shares no line with the library but the map's positions and spacing.
 """
 
 import numpy as np
 import reference
 from conftest import loop, motions
 
-T, M, K, N, H, SEEDS = 36, 60, 7, 6, 9, 4
+T, M, K, N = 36, 60, 7, 6
 LAMBDA, GAMMA, TAU, DELTAS, MASKS = 0.7, 25.0, 0.8, 1.7, 1.2
-MEMORY, KAPPA, TEMPERATURE, EPS, RECALL = 4.0, 2.2, 0.11, 1e-3, 0.9
+TEMPERATURE, EPS = 0.11, 1e-3
 PLACES = loop(M)
 PLACES[18:27, 2] += np.pi  # a stretch that the map drove the other way
 
@@ -43,27 +43,18 @@ class Stream:
     def __init__(self, tables, odometry, index, similarity, weight):
         self.spacing = float(tables.spacing_m)
         self.delta, self.mask = DELTAS * self.spacing, DELTAS * MASKS * self.spacing
-        self.xy, self.theta = np.asarray(tables.grid.xy, float), PLACES[:, 2]
-        self.grid = {name: np.asarray(getattr(tables.grid, name)) for name in vars(tables.grid)}
+        self.xy = np.asarray(tables.places.grid.xy, float)
         self.odometry, self.weight = odometry.astype(float), weight.astype(float)
         self.index, self.similarity = index, similarity.astype(float)
         self.poses = [np.zeros(3)]
         for motion in self.odometry[1:]:
             self.poses.append(moved(self.poses[-1], motion))
-        gap = np.linalg.norm(self.xy[:, None] - self.xy[None], axis=2)
-        self.gap = np.take_along_axis(gap, self.grid["neighbour"].T, axis=1)
 
     def rho(self, r):
         return np.where(r <= self.delta, r**2 / 2, self.delta * (r - self.delta / 2))
 
     def local(self, past, t):
         return (np.array(self.poses)[past, :2] - self.poses[t][:2]) @ turn(self.poses[t][2])
-
-    def look_up(self, xy):
-        cell = np.floor((xy - self.grid["corner"]) / self.grid["cell_m"]).astype(int)
-        is_on = np.all((cell >= 0) & (cell < self.grid["shape"]), axis=-1)
-        flat = np.where(is_on, cell[..., 0] * self.grid["shape"][1] + cell[..., 1], 0)
-        return np.where(is_on, self.grid["nearest"][flat], -1)
 
     # What the frontend says.
 
@@ -116,143 +107,15 @@ class Stream:
         posed = int(np.argmin(np.where(there | ~there.any(), total, np.inf)))
         s1, s2 = shapes[posed]
         row |= {"c_geom": s1 * s2, "a_aniso": -s1 / (s2 + EPS), "h_proxy": np.log(s1 * s2 + EPS)}
-        backwards = inside[posed][::-1]
         support = 1 - inside[posed].sum() / len(past)
-        stale = np.argmax(backwards) if backwards.any() else N
-        said = {"support": support, "stale": stale, "index": self.index[t, posed]}
+        said = {"support": support, "index": self.index[t, posed]}
         return row, said | {"pose": poses[posed], "is_second": posed != best}
-
-    # Joint branches.
-
-    def rescaled(self, t):
-        row = np.zeros(M)
-        there = self.index[t] >= 0
-        row[self.index[t][there]] = np.clip((self.similarity[t][there] - 0.1) / 0.8, 0, 1)
-        return row
-
-    def find(self, past, p, pose):
-        """Anchor of every frame, its position, and what its similarity costs."""
-        near = self.look_up(p @ turn(pose[2]).T + pose[:2])
-        anchor = np.full(len(past), -1)
-        for i, t in enumerate(past):
-            if near[i] >= 0:
-                there = self.grid["neighbour"][:, near[i]]
-                price = self.rho(self.gap[near[i]]) / self.delta**2 - self.rescaled(t)[there]
-                anchor[i] = there[np.argmin(price)]
-        return anchor
-
-    def price(self, past, p, anchor, pose):
-        similarity = np.array([self.rescaled(t)[a] for t, a in zip(past, anchor, strict=True)])
-        r = reference.residuals(pose, p, self.xy[anchor])
-        geom = np.where(anchor >= 0, self.rho(r) / self.delta**2, np.inf)
-        return geom, 1 - similarity, r
-
-    def follow(self, past, p, w, seed):
-        pose, anchor = np.array(seed, float), self.find(past, p, seed)
-        kappa = KAPPA * (self.spacing / self.delta) ** 2
-        geom, sim, r = self.price(past, p, anchor, pose)
-        on = np.where(geom + sim < 1, w / (np.maximum(r, self.delta) * self.delta), 0)
-        if on.any():
-            x, y = p @ [1, 1j], self.xy[anchor] @ [1, 1j]
-            x0, y0 = (on @ x) / on.sum(), (on @ y) / on.sum()
-            spin = np.sum(on * np.conj(x - x0) * (y - y0)) + kappa * np.exp(1j * seed[2])
-            shift = y0 - x0 * spin / abs(spin)
-            pose = np.array([shift.real, shift.imag, np.angle(spin)])
-        fresh = self.find(past, p, pose)
-        old, new = (sum(self.price(past, p, a, pose)[:2]) for a in (anchor, fresh))
-        anchor = np.where(old <= new, anchor, fresh)
-        geom, sim, _ = self.price(past, p, anchor, pose)
-        each = np.minimum(1.0, geom + sim)
-        cost = w @ each + kappa * (1 - np.cos(pose[2] - seed[2]))
-        return {
-            "cost": cost,
-            "pose": pose,
-            "anchor": anchor,
-            "each": each,
-            "geom": geom,
-            "sim": sim,
-        }
-
-    def joint(self, t, carried):
-        past = np.arange(max(0, t - H + 1), t + 1)
-        w, p = np.exp(-(t - past) / MEMORY), self.local(past, t)
-        w /= w.sum()
-        seeds = [moved(carried, self.odometry[t])] if carried is not None else []
-        for row in self.index[t, :SEEDS]:
-            if row >= 0:
-                seeds += [np.r_[self.xy[row], self.theta[row] + extra] for extra in (0, np.pi)]
-        found = [self.follow(past, p, w, seed) for seed in seeds]
-        best = min(found, key=lambda branch: branch["cost"])
-        away = [np.linalg.norm(b["pose"][:2] - best["pose"][:2]) for b in found]
-        rival = [b["cost"] for b, m in zip(found, away, strict=True) if m > 3 * self.delta]
-        on = best["geom"] + best["sim"] < 1
-        pair = on[1:] & on[:-1]
-        dp, dq = np.diff(p, axis=0), np.diff(self.xy[best["anchor"]], axis=0)
-        mismatch = np.sum((dq - dp @ turn(best["pose"][2]).T) ** 2, axis=1)
-        return best["pose"], {
-            "tao_window": best["cost"],
-            "tao_geom": np.sum(w[on] * best["geom"][on]),
-            "tao_sim": np.sum(w[on] * best["sim"][on]),
-            "tao_vel": LAMBDA * (mismatch[pair].mean() if pair.any() else 0) / self.delta**2,
-            "tao_rival": min([1.0, *rival]),
-            "tao_align": lepski(best["each"][::-1]),
-            "support": 1 - on.mean(),
-        }
-
-    # The filter on the map's graph.
-
-    def recursive(self):
-        """Yield the probability of not being where the belief is strongest."""
-        mass, off = np.full((2, M), 0.7 / (2 * M)), 0.3
-        near = self.grid["neighbour"].T
-        for t in range(T):
-            dx, dy, da = self.odometry[t]
-            driven = np.hypot(dx, dy)
-            doubt = 0.5 * self.spacing * min(1.0, driven / (0.5 * self.spacing))
-            variance = doubt**2 + (0.1 * self.spacing) ** 2 + (0.15 * driven) ** 2
-            kernel = np.exp(-(self.gap**2) / 2 / variance)
-            spread = np.array([(kernel * side[near]).sum(1) / kernel.sum(1) for side in mass])
-            arriving = np.zeros((2, M))
-            for m in range(M):
-                heading = self.theta[m] - da
-                for side, sign in ((0, -1), (1, 1)):
-                    before = self.xy[m] + sign * turn(heading) @ [dx, dy]
-                    source = int(self.look_up(before))
-                    gap = np.linalg.norm(self.xy[source] - before)
-                    if source >= 0 and gap < 2 * self.spacing:
-                        is_same = np.cos(self.theta[source] - heading) >= 0
-                        arriving[side, m] = 0.98 * spread[side if is_same else 1 - side, source]
-            gone = max(1 - off - arriving.sum(), 0)
-            mass = (arriving + 0.1 * off / (2 * M)) * np.exp(8 * self.rescaled(t))
-            off = 0.9 * off + gone
-            mass, off = mass / (mass.sum() + off), off / (mass.sum() + off)
-            here = self.xy[np.argmax(mass.sum(0))]
-            local = np.linalg.norm(self.xy - here, axis=1) < 6 * self.spacing
-            yield 1 - mass[:, local].sum()
 
     def rows(self):
         """Return what every frame says: signals, and the answer of the best rank branch."""
-        carried, rows, answers = None, [], []
-        for t, elsewhere in enumerate(self.recursive()):
+        rows, answers = [], []
+        for t in range(T):
             rank, answer = self.rank(t)
-            carried, joint = self.joint(t, carried)
-            joint |= {"recursive": elsewhere, "tao": joint["tao_align"] + RECALL**N * elsewhere}
-            rows.append(self.frontend(t) | rank | joint)
+            rows.append(self.frontend(t) | rank | {"support": answer["support"]})
             answers.append(answer)
         return rows, answers
-
-
-def lepski(each):
-    """Mean over the longest window whose interval meets those of all shorter ones."""
-    lows, highs, kept = [], [], each[0]
-    for length in (2, 3, 5, 8, 13, 20, 30, 45, 60):
-        part = each[:length]
-        n, mean = len(part), np.mean(part)
-        shrunk = (part.sum() + 0.5) / (n + 1)
-        half = 1.2 * max((4 * shrunk * (1 - shrunk)) ** 2, 0.05) / np.sqrt(n)
-        lows.append(mean - half)
-        highs.append(mean + half)
-        if max(lows) > min(highs):
-            return kept
-        kept = mean
-    return kept

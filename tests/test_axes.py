@@ -13,7 +13,7 @@ from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.stream import replay
 
-BASE = StreamConfig(window=8, branches=12, joint_window=10, joint_seeds=6)
+BASE = StreamConfig(window=8, branches=12)
 PLACES = loop(60)
 
 AXES = {

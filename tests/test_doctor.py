@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def found():
-    small = taojax.StreamConfig(window=4, branches=5, joint_window=8, joint_seeds=3)
+    small = taojax.StreamConfig(window=4, branches=5)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(taojax, "StreamConfig", lambda: small, raising=False)
         return doctor.examine()

@@ -17,7 +17,7 @@ from taojax.runtime.explain import TOLERANCE, explain
 from taojax.runtime.score import score
 from taojax.verbs.explain_page import ranges
 
-SHAPE = {"window": 6, "branches": 5, "joint_window": 8, "joint_seeds": 3}
+SHAPE = {"window": 6, "branches": 5}
 LAG = VerdictConfig(lag=4, window_frames=4)
 CALIBRATION = made_up("place", middle=-9.0, gain=2.0)
 

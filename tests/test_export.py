@@ -20,7 +20,7 @@ from taojax.specs import load_spec
 
 T = 60
 FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]
-SETTINGS = "[stream]\njoint_window = 8\njoint_seeds = 3\n"
+SETTINGS = "[stream]\nwindow = 6\n"
 
 ALONE = """
 import sys

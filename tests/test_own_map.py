@@ -129,7 +129,7 @@ def test_padding_changes_no_belief(rng):
     assert more.grid.xy.shape[0] == growing.LEAST_PADDED
     found = []
     for tables in (plain, more):
-        places, m = tables.places, tables.grid.xy.shape[0]
+        places, m = tables.places, tables.places.grid.xy.shape[0]
         belief = uninformed(config, m, places.n_known)
         for motion, index in ((2.0, 7), (2.5, 8), (2.0, 9)):
             belief = predict(config, places, belief, jnp.array([motion, 0.1, 0.1]))

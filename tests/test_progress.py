@@ -166,7 +166,7 @@ def test_stretches_that_delete_the_map_are_refused(tmp_path):
 def runs(tmp_path_factory):
     """The same route scored at two lengths of a row."""
     folder = tmp_path_factory.mktemp("progress")
-    stream = StreamConfig(window=8, branches=20, joint_window=12, joint_seeds=6)
+    stream = StreamConfig(window=8, branches=20)
     found = {}
     for row_m in (1.0, 5.0):
         audit = AuditConfig(r_in_m=2 * row_m, r_out_m=5 * row_m, n_bootstrap=10)

@@ -19,7 +19,7 @@ from taojax.runtime.score import score
 from taojax.verbs import rerun
 
 SMALL = Config(
-    stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3),
+    stream=StreamConfig(window=6, branches=5),
     verdict=VerdictConfig(lag=4, window_frames=4),
 )
 

@@ -14,7 +14,7 @@ def test_every_anchor_of_an_evenly_spaced_line_finds_itself(spacing_m, axis):
     poses = np.zeros((400, 3))
     poses[:, axis] = spacing_m * np.arange(400)
     tables = map_tables(poses)
-    found = look_up(tables.grid, jnp.asarray(poses[:, :2], jnp.float32))
+    found = look_up(tables.places.grid, jnp.asarray(poses[:, :2], jnp.float32))
     np.testing.assert_array_equal(found, np.arange(400))
 
 

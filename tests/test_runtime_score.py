@@ -14,7 +14,7 @@ from taojax.runtime.watch import load_map
 from taojax.specs import column_names
 
 SMALL = Config(
-    stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3),
+    stream=StreamConfig(window=6, branches=5),
     verdict=VerdictConfig(lag=4, window_frames=4),
 )
 

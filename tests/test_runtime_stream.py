@@ -15,7 +15,7 @@ from taojax.runtime.frames import STATUSES, Frame
 from taojax.runtime.maps import MapTables, map_spacing_m, map_tables
 from taojax.runtime.stream import init, replay, step
 
-SMALL = StreamConfig(window=8, branches=6, joint_window=8, joint_seeds=4)
+SMALL = StreamConfig(window=8, branches=6)
 RANK = StreamConfig(window=8, branches=6, association="rank")
 T, M = 40, 60
 
@@ -111,7 +111,7 @@ def test_the_literal_cost_equals_a_plain_rewrite_over_the_window(rng):
             y + np.sin(a) * dx + np.cos(a) * dy,
             a + da,
         ]
-    xy, spacing = np.asarray(tables.grid.xy, float), float(tables.spacing_m)
+    xy, spacing = np.asarray(tables.places.grid.xy, float), float(tables.spacing_m)
     delta, mask = 3 * spacing, 9 * spacing
     for t in (2, n - 1, T - 1):
         past = np.arange(max(0, t - n + 1), t + 1)

@@ -18,7 +18,7 @@ from taojax.runtime.maps import map_tables
 from taojax.runtime.score import replay_log, score
 from taojax.runtime.trials import in_trials, replay_trials
 
-SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(stream=StreamConfig(window=6, branches=5))
 RANK = replace(SMALL, {"association": "rank"})
 """Compiles in a fraction of the time; what is tested does not depend on it."""
 

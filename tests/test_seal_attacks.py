@@ -22,7 +22,7 @@ from taojax.errors import InputError
 from taojax.runtime import rivals
 from taojax.runtime.score import score
 
-SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(stream=StreamConfig(window=6, branches=5))
 
 
 @pytest.fixture(scope="module")

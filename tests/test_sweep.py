@@ -29,7 +29,7 @@ branches = [3, 8]
 joint_window = [15, 18]
 joint_seeds = [2, 4]
 """
-BASE = StreamConfig(window=7, branches=8, joint_window=18, joint_seeds=4)
+BASE = StreamConfig(window=7, branches=8)
 
 
 def frames_of(rng, n=40, k=10):

@@ -22,7 +22,7 @@ from taojax.errors import InputError
 from taojax.runtime.score import score
 
 ROOT = Path(taojax.__file__).parents[1]
-SMALL = Config(stream=StreamConfig(window=6, branches=5, joint_window=8, joint_seeds=3))
+SMALL = Config(stream=StreamConfig(window=6, branches=5))
 FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
 """Rank compiles in a fraction of the time; what is tested does not depend on it."""
 

@@ -23,7 +23,7 @@ from taojax.runtime.score import score
 from taojax.runtime.watch import MOST_BYTES, LineError, Watch, load_map, parse
 from taojax.tables import read_table
 
-SHAPE = {"window": 6, "branches": 5, "joint_window": 8, "joint_seeds": 3}
+SHAPE = {"window": 6, "branches": 5}
 LAG = VerdictConfig(lag=4, window_frames=4)
 CONFIG = Config(stream=StreamConfig(**SHAPE), verdict=LAG)
 RANK = Config(stream=StreamConfig(**SHAPE, association="rank"), verdict=LAG)

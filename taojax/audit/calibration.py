@@ -1,37 +1,13 @@
 """From signals to thresholds and probabilities; everything is fitted on the calibration split."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from taojax.audit.labels import CalibrationSplit
-from taojax.detector import LIST_RECALL, Detector, probability
-
-BLURRED = {
-    "top1_w5": 0.45,
-    "tao": 0.9,
-    "tao_window": 0.6,
-    "recursive": 0.3,
-    "tao_rival": -0.3,
-    "entropy": 0.0,
-}
-"""Signal -> log odds per standard deviation before any label is seen, for a map whose own images
-are taken for one another half of the time. Similarity level, aligned evidence with an adaptive and
-with a long memory, the recursive filter, and ambiguity: several equally good places speak for being
-off the map."""
-
-DISTINCT = {
-    "top1_w5": 0.3,
-    "tao": 0.9,
-    "tao_window": 0.6,
-    "recursive": 1.2,
-    "tao_rival": -0.3,
-    "entropy": 0.4,
-}
-"""The same for a map that tells all its places apart: there a filter that adds up the answers of
-every frame, and a list that agrees with itself, can be believed."""
+from taojax.detector import Detector, probability
 
 VIEW = ("top1", "margin", "entropy")
 """What one view tells: its best similarity, and how the list stands out (paper, section 3.3)."""
@@ -41,17 +17,26 @@ LOGISTIC = {
     "joint_features": (*VIEW, "velocity", "c_geom", "a_aniso", "h_proxy", "tao_rank"),
 }
 """Row of metrics.csv -> features of a plain logistic model, the paper's two: of the frontend, and
-of the frontend and what Eq. 1 and its alignment say. Given to `fit` besides its own six signals,
-margin and diagnostics change no test AUROC by more than .001 in default, h3 and h4."""
+of the frontend and what Eq. 1 and its alignment say."""
 
 PLAIN_PRECISION = 1.0
 """How firmly the weights of these two hold to zero, scikit-learn's habit; the bias as below."""
 
-PRIOR_PRECISION = 10.0
-"""How firmly the weights hold to the prior; one labelled effective frame weighs about 1/4."""
+PLAIN_BIAS_PRECISION = 0.01
+"""How firmly their bias holds to zero: hardly, for it follows how many frames are off the map."""
 
-BIAS_PRECISION = 0.01
-"""How firmly the bias holds to zero: hardly, for it follows how many frames are off the map."""
+PRIOR_PRECISION = 10.0
+"""How firmly weights hold to the pooled ones before they go half of the way, per unit of log odds
+squared; one labelled effective frame weighs about 1/4. Between 3 and 30 nothing changes by more
+than .01 in recall or wrong share (`python -m benchmarks verdict`)."""
+
+BIAS_PRECISION = 0.05
+"""The same for the bias, which follows how many answers are wrong here."""
+
+OF_THE_WAY = 0.5
+"""Share of the way from the pooled numbers to the fitted ones that is gone: half a recording is a
+narrow view of its other half. Of the left-out recordings all of it accepts .76 of the right answers
+with .034 wrong, half of it .74 with .019 (`python -m benchmarks verdict`)."""
 
 CORRELATED_FRAMES = 8.0
 """Neighbouring frames repeat each other: so many count as one."""
@@ -72,16 +57,6 @@ LEAST_PER_CLASS = 5
 
 FALLBACK = "The probability is a fallback"
 """So begins the note of a detector that had too few frames to be fitted."""
-
-
-def prior(map_recall: float) -> dict[str, float]:
-    """Return the prior weights that the map alone suggests.
-
-    Args:
-        map_recall: share of map images whose most similar other image lies nearby.
-    """
-    share = float(np.clip(2.0 * map_recall - 1.0, 0.0, 1.0))
-    return {name: (1.0 - share) * BLURRED[name] + share * DISTINCT[name] for name in DISTINCT}
 
 
 def _note(what: str, n_in: int, n_out: int) -> str:
@@ -143,57 +118,69 @@ def fit_logistic(
     return minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
 
 
-def fit(
-    calibration: CalibrationSplit,
-    map_recall: float = LIST_RECALL,
-) -> Detector:
-    """Fit the probability of being map-out: logistic, shrunk to a prior made from the map alone.
+def moved(
+    numbers: Float[np.ndarray, " g"],
+    z: Float[np.ndarray, "n f"],
+    is_positive: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, " g"]:
+    """Return pooled weights and bias moved part of the way to what fits some labelled answers.
 
     Args:
-        calibration: frames that may be fitted on; grey ones give scale but no label.
-        map_recall: how far the map tells its own places apart; sealed in the run's manifest.
+        numbers: pooled weights, the bias last (g = f + 1).
+        z: features, standardised as in the pool.
+        is_positive: the class whose log odds are modelled.
+    """
+    # Every feature is larger where that class is more likely: a negative weight is chance.
+    fitted = fit_logistic(
+        z,
+        is_positive,
+        effective_weights(is_positive),
+        start=numbers,
+        precision=np.append(np.full(len(numbers) - 1, PRIOR_PRECISION), BIAS_PRECISION),
+        is_signed=False,
+    )
+    return numbers + OF_THE_WAY * (fitted - numbers)
+
+
+def fit(calibration: CalibrationSplit, base: Detector) -> Detector:
+    """Refine the pooled numbers of being map-out by the labelled frames of a calibration half.
+
+    Args:
+        calibration: frames that may be fitted on, with the columns that `base` reads.
+        base: the shipped numbers.
 
     Returns:
-        The detector, as `fit_columns` gives it.
+        Weights half of the way from the pooled to the fitted ones; its threshold is the level that
+        accepts 95 % of the in-map calibration frames, NaN where there is none.
     """
-    weights = prior(map_recall)
-    what = f"{len(weights)} signals, shrunk to a prior that the map alone sets"
-    return fit_columns(calibration, weights, PRIOR_PRECISION, what)
+    x = np.stack([np.asarray(calibration.signals[name], float) for name in base.columns], axis=1)
+    known, is_out = calibration.is_in | calibration.is_out, calibration.is_out
+    z = ((x - base.mean) / base.scale)[known]
+    best = moved(np.append(base.weight, base.bias), z, is_out[known])
+    counts = int(calibration.is_in.sum()), int(is_out.sum())
+    note = _note(f"{len(base.columns)} signals, shrunk to pooled recordings", *counts)
+    return _accepting(base._replace(weight=best[:-1], bias=float(best[-1]), note=note), calibration)
+
+
+def _accepting(detector: Detector, calibration: CalibrationSplit) -> Detector:
+    """Return the detector with the level that accepts 95 % of the in-map calibration frames."""
+    inside = probability(detector, calibration.signals)[calibration.is_in]
+    return detector._replace(threshold=accepting_level(inside))
 
 
 def fit_plain(calibration: CalibrationSplit, columns: Sequence[str]) -> Detector:
     """Fit a plain logistic model of being map-out, as the paper's Table 3 has two of.
 
     Args:
-        calibration: frames that may be fitted on, with these signals.
+        calibration: frames that may be fitted on, with these signals; location and scale of each
+            come from all of them, labelled or not.
         columns: signals that it may read, as in `LOGISTIC`.
 
     Returns:
-        The detector, as `fit_columns` gives it; no prior but zero.
+        The detector; with one class, or a handful of frames, it knows nothing. Its threshold is
+        the level that accepts 95 % of the in-map calibration frames; NaN where there is none.
     """
-    what = f"{len(columns)} signals, shrunk to zero"
-    return fit_columns(calibration, dict.fromkeys(columns, 0.0), PLAIN_PRECISION, what)
-
-
-def fit_columns(
-    calibration: CalibrationSplit, weights: Mapping[str, float], precision: float, what: str
-) -> Detector:
-    """Fit a logistic model of being map-out over some signals.
-
-    Location and scale of each signal come from all calibration frames, labelled or not; with one
-    class, or a handful of frames, the prior decides.
-
-    Args:
-        calibration: frames that may be fitted on; grey ones give scale but no label.
-        weights: signal -> log odds per standard deviation before any label is seen.
-        precision: how firmly the weights hold to these.
-        what: the model in words, for its note.
-
-    Returns:
-        The detector. Its threshold is the level that accepts 95 % of the in-map calibration
-        frames; NaN where there is none.
-    """
-    x = np.stack([np.asarray(calibration.signals[name], float) for name in weights], axis=1)
+    x = np.stack([np.asarray(calibration.signals[name], float) for name in columns], axis=1)
     mean, spread = x.mean(axis=0), x.std(axis=0)
     scale = np.where(spread > _TINY, spread, 1.0)
     known = calibration.is_in | calibration.is_out
@@ -202,22 +189,23 @@ def fit_columns(
         ((x - mean) / scale)[known],
         is_out,
         effective_weights(is_out),
-        start=np.append(list(weights.values()), 0.0),
-        precision=np.append(np.full(len(weights), precision), BIAS_PRECISION),
+        start=np.zeros(len(columns) + 1),
+        precision=np.append(np.full(len(columns), PLAIN_PRECISION), PLAIN_BIAS_PRECISION),
     )
     # Told from the mean in-map frame, a term says what makes a frame unlike the places it knows.
     level = x[calibration.is_in].mean(axis=0) if calibration.is_in.any() else mean
     detector = Detector(
-        columns=tuple(weights),
+        columns=tuple(columns),
         mean=level,
         scale=scale,
         weight=best[:-1],
         bias=float(best[-1] + np.sum((level - mean) / scale * best[:-1])),
         threshold=float("nan"),
-        note=_note(what, int((~is_out).sum()), int(is_out.sum())),
+        note=_note(
+            f"{len(columns)} signals, shrunk to zero", int((~is_out).sum()), int(is_out.sum())
+        ),
     )
-    inside = probability(detector, calibration.signals)[calibration.is_in]
-    return detector._replace(threshold=accepting_level(inside))
+    return _accepting(detector, calibration)
 
 
 def accepting_level(inside: Float[np.ndarray, " n"]) -> float:

@@ -62,8 +62,8 @@ def glossary() -> Mapping[str, str]:
         "FAR at 95 %": about("far_at_95"),
         "prevalence": about("prevalence_test"),
         "threshold": about("threshold"),
-        "probability": "calibrated probability of being map-out, from the sealed signals of the "
-        "frame alone; `fused` in tables and figures",
+        "probability": "calibrated probability of being map-out, with hindsight as the final "
+        "verdict; `fused` in tables and figures",
         "interval unknown": "every resample of the frames gives this same number, as it does when "
         "all frames or none are counted; that is no proof that it is exact",
         "95 % interval": "from a circular block bootstrap over time: whole blocks of frames are "
@@ -88,7 +88,7 @@ PLAIN = (
     "the calibration half"
 )
 
-FUSED = "calibrated probability of being off the map, from the sealed signals of the frame alone"
+FUSED = "calibrated probability of being off the map, with hindsight as the final verdict"
 
 
 @cache

@@ -24,6 +24,9 @@ class Judgement(NamedTuple):
     signals: dict[str, np.ndarray]
     """Column -> (T,), the sealed table."""
 
+    delayed: dict[str, np.ndarray]
+    """The same of the final answers' features."""
+
     map_m: Float[np.ndarray, "m 2"]
     query_m: Float[np.ndarray, "t 2"]
     """True positions, metres."""
@@ -119,17 +122,16 @@ def judge(
     # One splitter makes both halves, of the features of the answers as of the signals.
     base = for_run(shipped(), audit.max_wrong, config.verdict.lag)
     features = {name: run.signals[name] for name in base.now.columns}
-    features |= {name: run.delayed[name] for name in base.final.columns}
+    features |= {name: run.delayed[name] for name in base.final.columns + base.map_out.columns}
     first = labels.split_frames(
         signals | features, label, calibration_share=share, gap_frames=gap
     ).calibration
-    recall = float(run.manifest.get("map_recall", calibration.LIST_RECALL))
     half = answers.at(first.frame)
     refined = [
         risk.refine(pooled, first, own, audit.max_wrong)
         for pooled, own in ((base.now, half.now), (base.final, half.final))
     ]
-    model = calibration.fit(first, recall)
+    model = calibration.fit(first, base.map_out)
     logistic = {
         name: calibration.fit_plain(first, columns)
         for name, columns in calibration.LOGISTIC.items()
@@ -140,7 +142,9 @@ def judge(
     measured = signals | {name: verdicts[name] for name in (risk.NOW, risk.FINAL)}
     with_fused = measured | {name: probability(plain, signals) for name, plain in logistic.items()}
     with_fused[tables.FUSED] = verdicts["probability_map_out"]
-    splits = labels.split_frames(with_fused, label, calibration_share=share, gap_frames=gap)
+    splits = labels.split_frames(
+        with_fused | features, label, calibration_share=share, gap_frames=gap
+    )
     tested, both = answers.at(splits.test.frame), {"now": refined[0], "final": refined[1]}
 
     inside, test = label == "in_map", splits.name == "test"
@@ -156,6 +160,7 @@ def judge(
         config=config,
         manifest=run.manifest,
         signals=run.signals,
+        delayed={name: run.delayed[name] for name in base.final.columns},
         map_m=map_m,
         query_m=truth.xy_m,
         nearest_m=nearest,

@@ -80,10 +80,8 @@ class Judged(NamedTuple):
 def _tracks(run: Run, place_m: Float[np.ndarray, "t 2"]) -> dict[str, Track]:
     signals = run.signals
     away = np.hypot(signals["x_m"] - place_m[:, 0], signals["y_m"] - place_m[:, 1])
-    may_accept = signals["status"] == "ok"
-    if "stale" in signals:
-        may_accept = may_accept & (signals["stale"] <= 0)
-    found = {"tao": Track(np.where(np.isnan(away), np.inf, away), signals["tao"], may_accept)}
+    is_answered = signals["status"] == "ok"
+    found = {"tao": Track(np.where(np.isnan(away), np.inf, away), signals["tao"], is_answered)}
     if run.decisions is not None:
         found |= {name: _verdict_track(run.decisions, name, place_m) for name in ("final", "now")}
     for name, track in (run.tracks or {}).items():

@@ -5,22 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from taojax.audit.calibration import CORRELATED_FRAMES, effective_weights, fit_logistic
+from taojax.audit.calibration import CORRELATED_FRAMES, moved
 from taojax.audit.labels import CalibrationSplit
 from taojax.risk import Risk, at_most, probability_wrong
-
-PRIOR_PRECISION = 10.0
-"""How firmly weights hold to the pooled ones before they go half of the way, per unit of log odds
-squared; one labelled effective frame weighs about 1/4. Between 3 and 30 nothing changes by more
-than .01 in recall or wrong share (`python -m benchmarks verdict`)."""
-
-BIAS_PRECISION = 0.05
-"""The same for the bias, which follows how many answers are wrong here."""
-
-OF_THE_WAY = 0.5
-"""Share of the way from the pooled numbers to the fitted ones that is gone: half a recording is a
-narrow view of its other half. Of the left-out recordings all of it accepts .76 of the right answers
-with .034 wrong, half of it .74 with .019 (`python -m benchmarks verdict`)."""
 
 HARSHER = 4.0
 """The odds of being wrong may be so many times higher on the frames to come than on the
@@ -127,17 +114,7 @@ def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> R
 
 def _moved(base: Risk, z: Float[np.ndarray, "n f"], is_wrong: Bool[np.ndarray, " n"]) -> Risk:
     """Return the numbers moved part of the way to what fits some labelled answers."""
-    start = np.append(base.weight, base.bias)
-    # Every feature is larger where an answer is more likely wrong: a negative weight is chance.
-    fitted = fit_logistic(
-        z,
-        is_wrong,
-        effective_weights(is_wrong),
-        start=start,
-        precision=np.append(np.full(len(base.weight), PRIOR_PRECISION), BIAS_PRECISION),
-        is_signed=False,
-    )
-    numbers = start + OF_THE_WAY * (fitted - start)
+    numbers = moved(np.append(base.weight, base.bias), z, is_wrong)
     return base._replace(weight=numbers[:-1], bias=float(numbers[-1]))
 
 

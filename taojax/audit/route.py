@@ -61,20 +61,21 @@ def _candidates(
 
 
 def _model(judgement: Judgement, names: list[str]) -> dict[str, Any]:
-    """Return what turns signals into log odds above the mean in-map frame."""
-    detector = judgement.detector
+    """Return what turns features into the final answer's log odds of being wrong."""
+    risk = judgement.calibration.final
     return {
-        "columns": [names.index(name) for name in detector.columns],
-        "mean": detector.mean.tolist(),
-        "scale": detector.scale.tolist(),
-        "weight": detector.weight.tolist(),
-        "threshold": None if np.isnan(detector.threshold) else float(detector.threshold),
+        "columns": [names.index(name) for name in risk.columns],
+        "mean": risk.mean.tolist(),
+        "scale": risk.scale.tolist(),
+        "weight": risk.weight.tolist(),
+        "threshold": None if np.isnan(risk.level) else float(risk.level),
     }
 
 
 def _signals(judgement: Judgement) -> list[dict[str, Any]]:
     """Return name, unit, meaning and frozen threshold of every signal and of our probabilities."""
     specs = {c["name"]: c for c in load_spec("signals")["columns"] if c.get("signal")}
+    features = {c["name"]: c for c in load_spec("delayed")["columns"]}
     table, titles, found = judgement.metrics, names_of_signals(), []
     for name, threshold in zip(table["signal"], table["threshold"], strict=True):
         spec = specs.get(str(name), {"about": titles[str(name)]})
@@ -86,7 +87,10 @@ def _signals(judgement: Judgement) -> list[dict[str, Any]]:
                 "threshold": None if np.isnan(threshold) else float(threshold),
             }
         )
-    return found
+    return found + [
+        {"name": name, "unit": "1", "about": features[name]["about"], "threshold": None}
+        for name in judgement.calibration.final.columns
+    ]
 
 
 def route_json(
@@ -110,6 +114,7 @@ def route_json(
     verdicts = judgement.verdicts
     columns = judgement.signals | {name: verdicts[name] for name in (NOW, FINAL)}
     columns[FUSED] = verdicts["probability_map_out"]
+    columns |= judgement.delayed
     columns |= {name: probability(own, columns) for name, own in judgement.logistic.items()}
     pose = np.stack([verdicts["x_m"], verdicts["y_m"]], axis=1).astype(float)
     status, status_at = np.unique(judgement.signals["status"].astype(str), return_inverse=True)

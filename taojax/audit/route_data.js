@@ -9,7 +9,7 @@ const rows = run.candidates.wide
   ? new Uint32Array(bytes(run.candidates.row)) : new Uint16Array(bytes(run.candidates.row));
 const alike = new Uint16Array(bytes(run.candidates.alike));
 const n = run.verdict.length, k = run.candidates.k;
-const fused = run.signals.length - 1;
+const doubt = run.signals.findIndex((signal) => signal.name === "probability_wrong");
 const value = (signal, i) => values[signal * n + i];
 const share = (i, rank) => alike[i * k + rank] / 65535;
 const similarity = (i, rank) =>

@@ -123,7 +123,7 @@ const drawStrip = () => {
   }
   let path = "", pen = "M";
   for (let i = 0; i < n; i++) {
-    const p = value(fused, i);
+    const p = value(doubt, i);
     if (Number.isNaN(p)) { pen = "M"; continue; }
     path += `${pen}${i + 0.5} ${(69 - 38 * p).toFixed(1)}`;
     pen = "L";

@@ -50,7 +50,7 @@ let later;
 const show = (wanted, { quiet = false } = {}) => {
   const i = (frame = Math.max(0, Math.min(n - 1, wanted)));
   const name = i * run.every, verdict = VERDICT[run.verdict[i]];
-  const kind = run.kinds[Number(run.kind[i])], p = value(fused, i);
+  const kind = run.kinds[Number(run.kind[i])], p = value(doubt, i);
   at("route").dataset.frame = name;
   at("route-scrub").value = i;
   at("route-scrub").setAttribute("aria-valuetext", `frame ${name}: ${verdict}`);

@@ -242,7 +242,7 @@ def evaluate_sweep(run: Path, truth: Path, config: Config) -> tuple[str, ...]:
     nearest = labels.nearest_map_distance(known.xy_m, sealed.map_m)
     label = labels.label_frames(nearest, audit.r_in_m, audit.r_out_m)
     # No test signal may remember a calibration frame, whatever the configuration.
-    gap = int(np.nanmax([sealed.grid["window"], sealed.grid["joint_window"]]))
+    gap = int(np.nanmax([*sealed.grid["window"], config.stream.window]))
     judgement = judge(sealed, label, config, gap_frames=gap)
     files: dict[str, str | bytes] = {}
     lines = [*judgement.sentences, *(f"Note: {note}." for note in sealed.manifest["notes"])]

@@ -1,11 +1,8 @@
-"""The static map, prepared for look-ups: which anchor is near, and which near one a list names."""
+"""The static map, prepared for look-ups: which anchor is near."""
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int, UInt
-
-from taojax.core.cost import huber
+from jaxtyping import Array, Float, Int
 
 
 class AnchorGrid(eqx.Module):
@@ -37,41 +34,6 @@ class AnchorGrid(eqx.Module):
 
     neighbour_m2: Float[Array, "b m"]
     """Their squared distances [m^2]."""
-
-
-def pool(
-    grid: AnchorGrid,
-    gamma: float | Float[Array, ""],
-    delta_m: float | Float[Array, ""],
-    index: Int[Array, " c"],
-    similarity: Float[Array, " c"],
-) -> UInt[Array, " m"]:
-    """Name the best anchor in every anchor's neighbourhood, for one frame.
-
-    Args:
-        grid: the map.
-        gamma: weight of similarity.
-        delta_m: Huber threshold [m].
-        index: `(c,)` anchors that the frame's list names, -1 = none.
-        similarity: `(c,)` theirs on the fixed scale.
-
-    Returns:
-        `(m,)` places in the list of the anchors that minimise neighbour distance cost +
-        gamma (1 - s); c where that is the anchor itself, unlisted. A place fits in a byte where an
-        anchor needs four, and the stream remembers many of these rows.
-    """
-    m, c = grid.xy.shape[0], index.shape[0]
-    listed = jnp.where(index >= 0, index, m)
-    place = jnp.full(m, c).at[listed].set(jnp.arange(c), mode="drop")
-    row = jnp.append(similarity, 0.0)[place]
-    # Neighbour by neighbour: an argmin over a gathered (m, b) array takes three times as long.
-    best, least = grid.neighbour[0], jnp.inf
-    for b in range(grid.neighbour.shape[0]):
-        other = grid.neighbour[b]
-        cost = huber(grid.neighbour_m2[b], delta_m) / delta_m**2 + gamma * (1.0 - row[other])
-        best = jnp.where(cost < least, other, best)
-        least = jnp.minimum(cost, least)
-    return place[best].astype(np.min_scalar_type(c))
 
 
 def look_up(grid: AnchorGrid, xy: Float[Array, "*n 2"]) -> Int[Array, "*n"]:

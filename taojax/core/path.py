@@ -8,7 +8,7 @@ agree. Counting agreements instead of costs gives a vote that no single frame ca
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import VerdictConfig
 from taojax.core.cost import huber
@@ -65,31 +65,47 @@ def _distances(
     return jnp.where(index >= 0, jnp.sqrt(dx**2 + dy**2) / gap_m, jnp.inf)
 
 
-def support(
+class Path(eqx.Module):
+    """An answer's path through the map: an anchor for each frame around it."""
+
+    pose: Float[Array, "3"]
+    """The answer, moved onto its anchors by the closed-form fit."""
+
+    anchor: Int[Array, " w"]
+    """Listed anchor that fits each frame best; -1 without any candidate."""
+
+    price: Float[Array, " w"]
+    """What each frame costs: 0 to 1, the price of a frame without support."""
+
+    relative: Float[Array, "w c"]
+    """Distances of all candidates from the predicted position, in tolerances."""
+
+    is_inlier: Bool[Array, " w"]
+    """Frames whose anchor lies within the tolerance."""
+
+
+def along(
     config: VerdictConfig,
     xy_map: Float[Array, "m 2"],
     gap_m: Float[Array, ""],
     pose: Float[Array, "3"],
     window: Window,
-) -> Support:
-    """Try an answer on the frames around it.
+) -> Path:
+    """Follow an answer through the frames around it.
 
     Args:
-        config: tolerance and Huber threshold.
+        config: tolerance, which is the Huber threshold too.
         xy_map: anchor positions [m].
         gap_m: median distance between neighbouring anchors [m].
         pose: the answer.
         window: the frames.
-
-    Returns:
-        The figures, after the fit; all finite, also without any candidate.
 
     Source:
         Paper, section 3.2 and Eq. 1: rho_delta of the residuals after the closed-form fit, plus
         similarity; each frame's part is capped at 1, the price of a frame without support.
     """
     tolerance = config.near_gaps + config.drift * window.way_gaps
-    total = jnp.maximum(jnp.sum(window.weight), _TINY)
+    rows = jnp.arange(window.index.shape[0])
 
     def priced(pose: Array) -> tuple[Array, Array, Array]:
         distance = _distances(xy_map, transform(pose[None], window.xy), window.index, gap_m)
@@ -101,7 +117,6 @@ def support(
         return relative, price, jnp.argmin(price, axis=1)
 
     relative, price, chosen = priced(pose)
-    rows = jnp.arange(chosen.shape[0])
     is_inlier = relative[rows, chosen] <= 1.0
     anchors = xy_map[jnp.maximum(window.index[rows, chosen], 0)]
     # The answer itself is one more pair, so that a few anchors cannot carry it away.
@@ -111,11 +126,39 @@ def support(
     fit = fit_se2(p, q, jnp.append(weight, 1.0))
     fitted = jnp.where(fit.is_degenerate, pose, fit.T_map_odom)
     relative, price, chosen = priced(fitted)
+    return Path(
+        fitted, window.index[rows, chosen], price[rows, chosen], relative,
+        relative[rows, chosen] <= 1.0,
+    )  # fmt: skip
+
+
+def support(
+    config: VerdictConfig,
+    xy_map: Float[Array, "m 2"],
+    gap_m: Float[Array, ""],
+    pose: Float[Array, "3"],
+    window: Window,
+) -> Support:
+    """Try an answer on the frames around it.
+
+    Args:
+        config: as for `along`, and so are the others.
+        xy_map: anchor positions [m].
+        gap_m: median distance between neighbouring anchors [m].
+        pose: the answer.
+        window: the frames.
+
+    Returns:
+        The figures, after the fit; all finite, also without any candidate.
+    """
+    path = along(config, xy_map, gap_m, pose, window)
+    total = jnp.maximum(jnp.sum(window.weight), _TINY)
+    share = lambda is_it: jnp.sum(jnp.where(is_it, window.weight, 0.0)) / total
+    level = jnp.where(window.index[:, 0] >= 0, window.scaled[:, 0], 0.0)
     return Support(
-        cost=jnp.sum(window.weight * price[rows, chosen]) / total,
-        vote=jnp.sum(jnp.where(relative[:, 0] <= 1.0, window.weight, 0.0)) / total,
-        listed=jnp.sum(jnp.where(jnp.any(relative <= 1.0, axis=1), window.weight, 0.0)) / total,
-        level=jnp.sum(window.weight * jnp.where(window.index[:, 0] >= 0, window.scaled[:, 0], 0.0))
-        / total,
+        cost=jnp.sum(window.weight * path.price) / total,
+        vote=share(path.relative[:, 0] <= 1.0),
+        listed=share(jnp.any(path.relative <= 1.0, axis=1)),
+        level=jnp.sum(window.weight * level) / total,
         frames=jnp.sum(window.weight),
     )

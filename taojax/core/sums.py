@@ -8,19 +8,12 @@ library call. All products are asked for in full precision: recent GPUs would us
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 
 def over_frames(x: Float[Array, "n *k"]) -> Float[Array, "*k"]:
     """Sum over the leading axis."""
     return jnp.tensordot(jnp.ones(x.shape[0], x.dtype), x, 1, precision="highest")
-
-
-def running(x: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
-    """Return the cumulative sums along the last axis."""
-    n = x.shape[-1]
-    return jnp.tensordot(x, jnp.asarray(np.triu(np.ones((n, n))), x.dtype), 1, precision="highest")
 
 
 def least(x: Float[Array, " n"]) -> Int[Array, ""]:

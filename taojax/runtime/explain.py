@@ -1,7 +1,7 @@
-"""One frame of a sealed run, looked at from inside: the window, its branches, what disagrees.
+"""One answer of a sealed run from inside: its path, who disagrees, where else it could be.
 
-The run is replayed from its sealed files by the runtime's own `step`, so what is told is what
-happened, and the frame's own row says whether it is.
+The path is followed again from the sealed files by the runtime's own function, so what is told is
+what happened, and the sealed cost says whether it is.
 """
 
 from pathlib import Path
@@ -12,104 +12,91 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from tqdm import tqdm
 
-from taojax.config import StreamConfig, from_toml
+from taojax.config import VerdictConfig, from_toml
+from taojax.core.belief import Places
+from taojax.core.path import Window, along
+from taojax.core.se2 import between, integrate, transform
 from taojax.errors import InputError
 from taojax.records import Run
-from taojax.runtime.frames import STATUSES, Frame, StreamRecord
-from taojax.runtime.inside import Inside, joint_inside, rank_inside
-from taojax.runtime.joint import DISTINCT_DELTAS, GAMMA
+from taojax.runtime import hindsight
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.runtime.stream import COMPILING, StreamState, cost_params, init, step
 from taojax.tables import MOTION, POSE, read_table, stacked
 
 TOLERANCE = 1e-4
-"""A replayed `tao` may differ from the sealed one by so much of the larger of 1 and itself: the
-rounding of sums on another machine. Beyond it another branch won, and nothing told would hold."""
+"""A recomputed cost may differ from the sealed one by so much: the rounding of sums on another
+machine. Beyond it another path was followed, and nothing told would hold."""
 
-N_BRANCHES = 5
-"""Branches told of, each at a place of its own."""
+N_PLACES = 5
+"""Hypotheses told of, each at a place of its own."""
 
 
 class WindowFrames(NamedTuple):
-    """The frames of a window on the cheapest branch, newest first."""
+    """The frames around an answer on its path, in order."""
 
     frame: Int[np.ndarray, " n"]
     """Row of the query."""
 
     path_m: Float[np.ndarray, "n 2"]
-    """Odometry, carried into the map by the branch."""
+    """Odometry, carried into the map by the answer."""
 
     anchor: Int[np.ndarray, " n"]
     """Map row that the frame is paired with, -1 without one."""
 
     cost: Float[np.ndarray, " n"]
-    """Unweighted; at most `Look.no_support` under joint association."""
+    """Unweighted, 0 to 1."""
 
     weight: Float[np.ndarray, " n"]
-    """Share of the frame in the cost of a branch."""
+    """Share of the frame in the cost of the answer."""
 
     is_inlier: Bool[np.ndarray, " n"]
-    """It supports the branch; the others disagree."""
+    """It supports the answer; the others disagree."""
 
 
-class Branches(NamedTuple):
-    """Hypotheses, cheapest first, no two at one place."""
+class Hypotheses(NamedTuple):
+    """The answer, then the cheapest other places."""
 
     cost: Float[np.ndarray, " k"]
+    """Of the path of each over the same frames, 0 to 1."""
+
     pose: Float[np.ndarray, "k 3"]
     """Where the robot is on each: x [m], y [m], theta [rad]."""
 
-    source: tuple[str, ...]
-    """What it was started from."""
-
 
 class Look(NamedTuple):
-    """What stands behind one row of signals.csv."""
+    """What stands behind one final answer."""
 
     frame: int
     status: str
     map_index: int
-    """-1 without a pose."""
+    """-1 where nothing is answered."""
 
-    pose: Float[np.ndarray, "3"]
-    """Reported pose; zero without one."""
-
-    signals: dict[str, float]
+    cost: float
     """Recomputed."""
 
-    sealed: dict[str, float]
-    """As signals.csv has them."""
+    sealed: float
+    """As delayed.csv has it."""
 
     window: WindowFrames
-    branches: Branches
+    hypotheses: Hypotheses
     candidate: Int[np.ndarray, " c"]
-    """Map rows of the newest frame's candidates, best first, without the missing ones."""
+    """Map rows of the frame's candidates, best first, without the missing ones."""
 
     similarity: Float[np.ndarray, " c"]
-    no_support: float
-    """What a frame costs that no anchor supports."""
-
-    unit: str
-    """Of the costs."""
-
     map_recall: float
 
     @property
     def gap(self) -> float:
-        """Difference between the replayed and the sealed `tao`, in units of its tolerance."""
-        got, want = self.signals["tao"], self.sealed["tao"]
-        return abs(got - want) / (TOLERANCE * max(1.0, abs(want)))
+        """Difference between the recomputed and the sealed cost, in units of the tolerance."""
+        return abs(self.cost - self.sealed) / TOLERANCE
 
 
-def sealed_tables(folder: Path, run: Run, config: StreamConfig) -> MapTables:
+def sealed_tables(folder: Path, run: Run) -> MapTables:
     """Rebuild the map of a run from its sealed files.
 
     Args:
         folder: the run, named in messages.
         run: from `read_run`.
-        config: its settings.
 
     Raises:
         InputError: the run was sealed before runs could be explained, or its map grew.
@@ -123,73 +110,65 @@ def sealed_tables(folder: Path, run: Run, config: StreamConfig) -> MapTables:
     if lacks:
         what = f"lacks {', '.join(lacks)}, sealed by newer versions"
         raise InputError(f"{folder}: {what}; score the data set again with `taojax score`")
-    poses = stacked(run.map_poses, POSE)
-    tables = map_tables(poses, config)
+    tables = map_tables(stacked(run.map_poses, POSE))
     names = ("map_scale", "map_recall", "evidence_unit_m")
     known = tuple(jnp.asarray(facts[name], jnp.float32) for name in names)
     return eqx.tree_at(lambda t: (t.scale, t.recall, t.places.unit_m), tables, known)
 
 
-def _distinct(inside: Inside, apart_m: float, most: float, sources: list[str]) -> Branches:
-    """Return the cheapest branches that are at places of their own."""
-    cost, pose = (np.asarray(leaf, float) for leaf in (inside.branch_cost, inside.branch_pose))
-    kept: list[int] = []
+def _around(
+    config: VerdictConfig, places: Places, seen: hindsight.Seen, at: int
+) -> tuple[Window, Int[np.ndarray, " n"]]:
+    """Return the window of a final answer, seen from its frame, and the rows in it."""
+    odometry, n = np.asarray(seen.odometry), hindsight.block_frames(config)
+    first, last = at // n * n, at
+    if config.lag:
+        ahead = hindsight.reach(config, places, odometry).ahead[first]
+        last = min(first + int(ahead), len(odometry) - 1)
+    rows = np.arange(max(0, first - hindsight.reach_frames(config)), last + 1)
+    frames = np.cumsum(np.asarray(hindsight.frame_pace(places, jnp.asarray(odometry)), float))
+    driven = np.hypot(odometry[:, 0], odometry[:, 1]).astype(float)
+    way = np.cumsum(driven) / float(places.gap_m)
+    rows = rows[np.abs(frames[rows] - frames[at]) <= config.window_frames + 1e-3]
+    # Poses in the frame of the answered one, forwards and backwards from it.
+    poses = np.asarray(integrate(jnp.asarray(odometry[rows])))
+    here = poses[np.searchsorted(rows, at)]
+    local = between(jnp.broadcast_to(jnp.asarray(here), poses.shape), jnp.asarray(poses))[:, :2]
+    listed = slice(0, hindsight.LISTED)
+    return Window(
+        xy=local,
+        way_gaps=jnp.asarray(np.abs(way[rows] - way[at]), jnp.float32),
+        index=jnp.asarray(seen.index[rows, listed]),
+        scaled=jnp.asarray(seen.scaled[rows, listed]),
+        weight=jnp.asarray(np.minimum(1.0, driven[rows] / float(places.unit_m)), jnp.float32),
+    ), rows
+
+
+def _elsewhere(
+    cost: Float[np.ndarray, " k"], pose: Float[np.ndarray, "k 3"], apart_m: float
+) -> Hypotheses:
+    """Return the first hypothesis and the cheapest others that are at places of their own."""
+    kept = [0]
     for row in np.argsort(cost, kind="stable"):
         gaps = [np.hypot(*(pose[row, :2] - pose[other, :2])) for other in kept]
-        # Beside the best one, a branch that nothing supports is none.
-        is_live = np.isfinite(cost[row]) and (cost[row] < most or not kept)
-        if is_live and all(gap > apart_m for gap in gaps):
+        # What no frame supports is no hypothesis.
+        if cost[row] < 1.0 - TOLERANCE and all(gap > apart_m for gap in gaps):
             kept.append(int(row))
-        if len(kept) == N_BRANCHES:
+        if len(kept) == N_PLACES:
             break
-    return Branches(cost[kept], pose[kept], tuple(sources[row] for row in kept))
+    return Hypotheses(cost[kept], pose[kept])
 
 
-def _sources(config: StreamConfig) -> list[str]:
-    """Name what every branch was started from, in the runtime's order."""
-    if config.association == "rank":
-        return [f"candidate {rank + 1} of every list" for rank in range(config.branches)]
-    n = min(config.joint_seeds, config.branches)
-    ahead = [f"candidate {rank + 1}" for rank in range(n)]
-    back = [f"{name}, driven the other way" for name in ahead]
-    return [*ahead, *back, "best branch of the frame before", "challenger of the frame before"]
-
-
-def _replayed(
-    config: StreamConfig, tables: MapTables, frames: Frame, *, progress: bool
-) -> tuple[StreamState, StreamState, Frame, StreamRecord]:
-    """Replay frames in order; return the states around the last one, and the last one itself."""
-    before = after = init(config, tables)
-    record, frame = None, None
-    # NumPy cuts a frame out faster than jax does.
-    frames = jax.tree.map(np.asarray, frames)
-    n = len(frames.odometry)
-    with tqdm(total=n, unit="frame", disable=not progress, leave=False, desc=COMPILING) as bar:
-        for t in range(n):
-            frame = jax.tree.map(lambda leaf, t=t: jnp.asarray(leaf[t]), frames)
-            before, (after, record) = after, step(config, tables, after, frame)
-            bar.set_description_str("replaying", refresh=False)
-            if t == 0:
-                # The time of the compiler says nothing of the frames to come.
-                bar.unpause()
-            bar.update()
-    if frame is None or record is None:
-        raise InputError("nothing to replay; name a frame")
-    return before, after, frame, record
-
-
-def explain(folder: Path, run: Run, frame: int, *, progress: bool = False) -> Look:
-    """Replay a sealed run up to one frame and look inside.
+def explain(folder: Path, run: Run, frame: int) -> Look:
+    """Follow the final answer of a frame once more.
 
     Args:
         folder: the run.
         run: read from it by `read_run`.
-        frame: row of signals.csv, from 0.
-        progress: draw a bar on stderr.
+        frame: row of delayed.csv, from 0.
 
     Returns:
-        What stands behind that row. No later frame is looked at, and memory does not grow with the
-        frames before.
+        What stands behind that answer: frames before it, and after it up to the lag.
 
     Raises:
         InputError: the run holds no such frame, or was sealed before runs could be explained.
@@ -197,60 +176,49 @@ def explain(folder: Path, run: Run, frame: int, *, progress: bool = False) -> Lo
     n_frames = len(run.signals["frame"])
     if not 0 <= frame < n_frames:
         raise InputError(f"{folder}: holds no frame {frame}; name one of 0 to {n_frames - 1}")
-    config = from_toml(folder / "config.toml").stream
-    tables = sealed_tables(folder, run, config)
-    table = read_table(folder / "odometry.csv", "query_odometry")
-    motion = stacked(table, MOTION)
+    config = from_toml(folder / "config.toml").verdict
+    tables = sealed_tables(folder, run)
+    motion = stacked(read_table(folder / "odometry.csv", "query_odometry"), MOTION)
     # A folder of trials starts afresh with each.
     length = run.manifest["trial_frames"] or n_frames
-    past = slice(frame // length * length, frame + 1)
-    leaves = (motion.astype(np.float32), run.index, run.similarity)
-    frames = Frame(*(jnp.asarray(leaf[past]) for leaf in leaves))
-    before, after, newest, record = _replayed(config, tables, frames, progress=progress)
-    inside = (
-        rank_inside(config, tables, after, newest)
-        if config.association == "rank"
-        else joint_inside(config, tables, before, newest)
+    start = frame // length * length
+    log = slice(start, start + length)
+    seen = hindsight.clean(
+        tables, motion[log].astype(np.float32), run.index[log], run.similarity[log]
     )
-    return _look(config, tables, run, frame, jax.tree.map(np.asarray, record), inside)
-
-
-def _look(
-    config: StreamConfig,
-    tables: MapTables,
-    run: Run,
-    frame: int,
-    record: StreamRecord,
-    inside: Inside,
-) -> Look:
-    filled, params = np.flatnonzero(inside.is_filled), cost_params(config, tables)
-    of_window = lambda leaf: np.asarray(leaf)[filled]
-    number, anchor = frame - filled, of_window(inside.anchor)
-    is_rank = config.association == "rank"
-    if is_rank:
-        anchor = np.where(anchor >= 0, run.index[number, np.maximum(anchor, 0)], -1)
+    places = tables.places
+    window, rows = _around(config, places, seen, frame - start)
+    answer = np.array([run.delayed[name][frame] for name in POSE])
+    listed = seen.index[frame - start, : hindsight.LISTED]
+    anchors = stacked(run.map_poses, POSE)[listed[listed >= 0]]
+    turned = anchors + np.array([0.0, 0.0, np.pi])
+    tried = jnp.asarray(np.concatenate([answer[None], anchors, turned]), jnp.float32)
+    follow = lambda pose: along(config, places.grid.xy, places.gap_m, pose, window)
+    paths = jax.jit(jax.vmap(follow))(tried)
+    price, weight = np.asarray(paths.price, float), np.asarray(window.weight, float)
+    share = weight / max(weight.sum(), 1e-9)
+    cost = price @ share
+    has_answer = run.signals["status"][frame] not in ("warming_up", "no_candidates")
+    carried = np.asarray(transform(paths.pose[0][None], window.xy), float)
     there = run.index[frame] >= 0
-    apart_m = DISTINCT_DELTAS * float(params.delta_m)
-    most = float(params.tau_missing) + float(params.gamma_similarity) if is_rank else GAMMA
     return Look(
         frame=frame,
-        status=STATUSES[int(record.status)],
-        map_index=int(record.map_index),
-        pose=np.asarray(record.pose, float),
-        signals={name: float(value) for name, value in record.signals.items()},
-        sealed={name: float(run.signals[name][frame]) for name in record.signals},
+        status=str(run.signals["status"][frame]),
+        map_index=int(run.delayed["map_index"][frame]) if has_answer else -1,
+        cost=float(cost[0]),
+        sealed=float(run.delayed["cost"][frame]),
         window=WindowFrames(
-            number,
-            of_window(inside.path_m).astype(float),
-            anchor.astype(int),
-            of_window(inside.cost).astype(float),
-            of_window(inside.weight).astype(float),
-            of_window(inside.is_inlier),
+            rows + start,
+            carried,
+            np.asarray(paths.anchor[0], int),
+            price[0],
+            share,
+            np.asarray(paths.is_inlier[0]),
         ),
-        branches=_distinct(inside, apart_m, np.inf if is_rank else most - 1e-3, _sources(config)),
+        hypotheses=_elsewhere(
+            cost, np.asarray(tried, float), float(config.place_gaps * places.gap_m)
+        ),
         candidate=run.index[frame][there].astype(int),
         similarity=run.similarity[frame][there].astype(float),
-        no_support=most,
-        unit="m^2" if is_rank else "1",
         map_recall=float(tables.recall),
     )

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from taojax.config import Config, StreamConfig, to_toml
+from taojax.config import Config, StreamConfig, VerdictConfig, to_toml
 from taojax.errors import MissingExtraError
 from taojax.records import SCHEMA, archive, digest, publish, refuse_if_taken, seal_of
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
@@ -35,7 +35,8 @@ LOADER = Path(__file__).with_name("load_step.py")
 class Inputs(NamedTuple):
     """What the artefact takes; the leaves in this order are its arguments."""
 
-    config: StreamConfig
+    stream: StreamConfig
+    verdict: VerdictConfig
     map: MapTables
     state: StreamState
     frame: Frame
@@ -49,7 +50,7 @@ class Outputs(NamedTuple):
 
 
 def named(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves in order, each under a dotted name such as `state.memory.joint.p`."""
+    """Return the leaves in order, each under a dotted name such as `state.filter.pace`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     name = lambda path: jax.tree_util.keystr(path, simple=True, separator=".")
     return {name(path): np.asarray(leaf) for path, leaf in leaves}
@@ -73,7 +74,9 @@ def artefact(inputs: Inputs, platform: str) -> bytes:
 
     def flat(*leaves: jax.Array) -> list[jax.Array]:
         # Lists alone: whoever loads it has none of this package's types.
-        return jax.tree.leaves(step(*jax.tree.unflatten(treedef, leaves)))
+        given = jax.tree.unflatten(treedef, leaves)
+        config = Config(stream=given.stream, verdict=given.verdict)
+        return jax.tree.leaves(step(config, given.map, given.state, given.frame))
 
     shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(inputs)]
     return bytes(export.export(jax.jit(flat), platforms=(platform,))(*shapes).serialize())
@@ -120,7 +123,7 @@ def export_step(
         dataset: a data folder, laid out as data_specs/README.md says; its first frames become the
             example.
         out: folder to make; must be absent or empty.
-        config: settings; only the stream part is used.
+        config: settings; those of the judge are not used.
         platforms: any of `cpu` and `cuda`, one artefact each.
         facts: what the manifest says of this command, machine and code.
 
@@ -138,14 +141,17 @@ def export_step(
     index, similarity = (a[:, : config.stream.branches] for a in candidates(observations))
     n = min(EXAMPLE_FRAMES, observations.trial_frames or EXAMPLE_FRAMES)
     log = Frame(*(jnp.asarray(a[:n]) for a in (observations.odometry, index, similarity)))
-    settings = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), config.stream)
-    inputs = Inputs(settings, tables, init(settings, tables), jax.tree.map(lambda a: a[0], log))
+    settings = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.float32), (config.stream, config.verdict)
+    )
+    state, first = init(config, tables), jax.tree.map(lambda a: a[0], log)
+    inputs = Inputs(settings[0], settings[1], tables, state, first)
 
-    outputs = Outputs(*step(config.stream, *inputs[1:]))
+    outputs = Outputs(*step(config, tables, state, first))
     said = [columns(outputs.record)]
     for t in range(1, len(log.odometry)):
         frame = jax.tree.map(lambda leaf, t=t: leaf[t], log)
-        outputs = Outputs(*step(config.stream, tables, outputs.state, frame))
+        outputs = Outputs(*step(config, tables, outputs.state, frame))
         said.append(columns(outputs.record))
     example = {
         "frame": log,

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from taojax.errors import InputError
 
-STATUSES = ("warming_up", "ok", "degenerate", "no_candidates", "lost")
-WARMING_UP, OK, DEGENERATE, NO_CANDIDATES, LOST = range(5)
+STATUSES = ("warming_up", "ok", "degenerate", "no_candidates")
+WARMING_UP, OK, DEGENERATE, NO_CANDIDATES = range(4)
 
 
 class Frame(eqx.Module):
@@ -27,7 +27,7 @@ class Frame(eqx.Module):
 
     weight: Float[Array, "*t"] | None = None
     """The frame's w_i in Eq. 1, >= 0, relative to the others of its window; all alike when left
-    out. NaN and negative ones count as 0. Joint branches weigh frames by their age alone."""
+    out. NaN and negative ones count as 0. The filter weighs frames by the way driven."""
 
 
 def check_frame(frame: Frame, axes: int = 0) -> None:
@@ -90,10 +90,10 @@ class StreamRecord(eqx.Module):
     """Position in `STATUSES`."""
 
     map_index: Int[Array, "*t"]
-    """The newest frame's anchor on the best branch, -1 without a pose."""
+    """The anchor of the newest frame, -1 without a pose."""
 
     pose: Float[Array, "*t 3"]
-    """The robot on the best branch; zero without a pose."""
+    """Where the robot is; zero without a pose."""
 
     has_pose: Bool[Array, "*t"]
     signals: Signals

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from taojax.config import StreamConfig, read_toml
+from taojax.config import Config, read_toml, replace
 from taojax.errors import ConfigError
 
 RANK = (
@@ -16,7 +16,8 @@ RANK = (
     "branches", "refine",
 )  # fmt: skip
 JOINT = (
-    "delta_spacings", "memory_frames", "kappa_spacings", "joint_window", "joint_seeds", "branches",
+    "evidence", "leave", "come_back", "start_off", "step_gaps", "reach_gaps", "place_gaps",
+    "near_gaps", "drift",
 )  # fmt: skip
 SETTINGS = {"rank": RANK, "joint": JOINT}
 """Association -> the settings that its signal depends on; the others would only repeat rows."""
@@ -39,14 +40,13 @@ DEFAULT: Grid = {
         "branches": (20, 100),
     },
     "joint": {
-        "delta_spacings": (1.5, 3.0, 6.0),
-        "memory_frames": (10.0, 20.0, 40.0),
-        "kappa_spacings": (1.25,),
-        "joint_window": (20, 60),
-        "joint_seeds": (5, 15),
+        "evidence": (2.0, 4.0, 8.0),
+        "leave": (0.005, 0.02, 0.08),
+        "come_back": (0.03, 0.1),
+        "near_gaps": (1.0, 2.0),
     },
 }
-"""256 rank configurations around the paper's, and 36 joint ones; the defaults are among them."""
+"""256 rank configurations around the paper's, and 36 of the filter; the defaults are among them."""
 
 MOST = 100_000
 """Configurations of one sweep at most."""
@@ -56,19 +56,18 @@ def _value(name: str, value: Any) -> float | int:
     """Return one value of the right type and range.
 
     Raises:
-        ConfigError: it is no number, or no setting of a stream may hold it.
+        ConfigError: it is no number, or the setting may not hold it.
     """
     if name == "refine":
         if not isinstance(value, bool):
             raise ConfigError(f"refine: {value!r} is not allowed; give a list of true and false")
         return value
-    is_whole = name in ("window", "branches", "joint_window", "joint_seeds")
+    is_whole = name in ("window", "branches")
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float):
         kind = "whole numbers" if is_whole else "numbers"
         raise ConfigError(f"{name}: {value!r} is not allowed; give a list of {kind}")
     value = value if is_whole else float(value)
-    changes: dict[str, Any] = {name: value}
-    StreamConfig(**changes)
+    replace(Config(), {name: value})
     return value
 
 
@@ -168,7 +167,7 @@ def _product(values: Mapping[str, Sequence[float | int]]) -> Iterator[dict[str, 
         yield dict(zip(values, chosen, strict=True))
 
 
-def expand(grid: Grid, config: StreamConfig) -> list[Row]:
+def expand(grid: Grid, config: Config) -> list[Row]:
     """Return the configurations in the order of the table.
 
     Args:
@@ -178,7 +177,8 @@ def expand(grid: Grid, config: StreamConfig) -> list[Row]:
     """
     rows: list[Row] = []
     for association, values in grid.items():
-        base = {name: getattr(config, name) for name in SETTINGS[association]}
+        part = config.stream if association == "rank" else config.verdict
+        base = {name: getattr(part, name) for name in SETTINGS[association]}
         tried = [base | changed for changed in _product(values)]
         is_known = base in tried
         for settings in tried if is_known else [*tried, base]:

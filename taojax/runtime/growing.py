@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from taojax.config import Config, VerdictConfig
 from taojax.core.anchors import AnchorGrid
-from taojax.core.belief import Places
 from taojax.drive import known_frames
 from taojax.risk import first_look
 from taojax.runtime import hindsight
@@ -24,7 +23,7 @@ from taojax.runtime.frames import NO_CANDIDATES, Frame, StreamRecord
 from taojax.runtime.maps import LEAST_ROWS, NEIGHBOURS, MapTables, capacity, map_tables
 from taojax.runtime.observations import Observations
 from taojax.runtime.retrieval import N_KEPT, retrieve
-from taojax.runtime.stream import init, replay
+from taojax.runtime.stream import answered, literal, replay
 
 BLOCK = 50
 """Frames that share a map: where one drives 2 m a frame the newest that they know is up to 100 m
@@ -105,16 +104,9 @@ def padded(tables: MapTables) -> MapTables:
     Args:
         tables: of `n` anchors; the same numbers come out of the padded ones.
     """
-    m = capacity(tables.grid.xy.shape[0], LEAST_PADDED, GROWTH)
-    places = tables.places
-    return eqx.tree_at(
-        lambda t: (t.grid, t.places),
-        tables,
-        (
-            _padded_grid(tables.grid, m),
-            Places(_padded_grid(places.grid, m), places.gap_m, places.unit_m, places.n_known),
-        ),
-    )
+    grid = tables.places.grid
+    m = capacity(grid.xy.shape[0], LEAST_PADDED, GROWTH)
+    return eqx.tree_at(lambda t: t.places.grid, tables, _padded_grid(grid, m))
 
 
 def _older(index: np.ndarray, similarity: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -190,13 +182,12 @@ def _replayed(
     n = rows.stop
     ahead = [np.concatenate([a[:n], np.repeat(a[n - 1 : n], n_stream - n, axis=0)]) for a in log]
     frames = Frame(*(jnp.asarray(a) for a in ahead))
-    _, record = replay(config.stream, tables, frames, init(config.stream, tables))
+    _, record = replay(literal(config), tables, frames)
     seen = hindsight.clean(tables, *log)
     both = hindsight.replay_both(config.verdict, tables, seen)
-    both = jax.tree.map(lambda leaf: leaf[rows], both)
     return _Part(
         jax.tree.map(lambda leaf: np.asarray(leaf)[rows], record),
-        both,
+        jax.tree.map(lambda leaf: leaf[rows], both),
         np.full(rows.stop - rows.start, tables.places.gap_m, np.float32),
     )
 
@@ -263,5 +254,8 @@ def replay_growing(
         for first, answers in zip(first_look(), joined.both, strict=True)
     )
     return Grown(
-        joined.record, hindsight.now_columns(now), hindsight.delayed_columns(final), tables
+        answered(config, joined.record, now),
+        hindsight.now_columns(now),
+        hindsight.delayed_columns(final),
+        tables,
     )

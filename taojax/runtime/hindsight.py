@@ -355,24 +355,50 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
     return jax.lax.map(lambda x: answered(*x), (jnp.arange(n), forward, backward, since[:n]))
 
 
-def clean(
-    tables: MapTables, odometry: np.ndarray, index: np.ndarray, similarity: np.ndarray
+def cleaned(
+    tables: MapTables,
+    odometry: Float[Array, "*t 3"],
+    index: Int[Array, "*t c"],
+    similarity: Float[Array, "*t c"],
 ) -> Seen:
-    """Make frames harmless and put their similarities on the fixed scale; host side, whole logs.
+    """Make frames harmless and put their similarities on the fixed scale.
 
     Args:
         tables: the map.
-        odometry: `(T, 3)`.
-        index: `(T, C)`.
-        similarity: `(T, C)`.
+        odometry: of the frames; where one is not finite the robot stands still and sees nothing.
+        index: `(c,)` retrieved map rows, -1 = none; those outside the map are none.
+        similarity: `(c,)` raw.
     """
-    is_usable = np.asarray(np.isfinite(odometry).all(axis=1))
-    odometry = np.where(is_usable[:, None], odometry, 0.0).astype(np.float32)
-    m = tables.places.grid.xy.shape[0]
-    is_there = (index >= 0) & (index < m) & np.isfinite(similarity) & is_usable[:, None]
-    scaled = np.asarray(rescale(tables.scale, jnp.asarray(np.where(is_there, similarity, 0.0))))
-    return Seen(odometry, np.where(is_there, index, -1).astype(np.int32),
-                np.where(is_there, scaled, 0.0).astype(np.float32))  # fmt: skip
+    is_usable = jnp.isfinite(odometry).all(axis=-1, keepdims=True)
+    is_there = (index >= 0) & (index < tables.places.grid.xy.shape[0])
+    is_there &= jnp.isfinite(similarity) & is_usable
+    scaled = rescale(tables.scale, jnp.where(is_there, similarity, 0.0))
+    room = [(0, 0)] * (index.ndim - 1) + [(0, max(0, LISTED - index.shape[-1]))]
+    return Seen(
+        jnp.where(is_usable, odometry, 0.0).astype(jnp.float32),
+        jnp.pad(jnp.where(is_there, index, -1), room, constant_values=-1).astype(jnp.int32),
+        jnp.pad(jnp.where(is_there, scaled, 0.0), room).astype(jnp.float32),
+    )
+
+
+def clean(
+    tables: MapTables, odometry: np.ndarray, index: np.ndarray, similarity: np.ndarray
+) -> Seen:
+    """Return `cleaned` frames of a whole log as NumPy arrays."""
+    log = (jnp.asarray(leaf) for leaf in (odometry, index, similarity))
+    return jax.tree.map(np.asarray, cleaned(tables, *log))
+
+
+def tao(features: Float[Any, "*t f"]) -> Float[Any, "*t"]:
+    """Return the off-map signal of answers: cost along the path, and doubt of the place.
+
+    The sum of `cost_long`, Eq. 1 along the filter's path, and the probability of not being at the
+    answered place. The one grows where a path is found that does not fit, the other where several
+    fit. Of the sums of one cost and one probability that were tried this one ranks the calibration
+    halves of 66 recordings best: AUROC .921, each cost alone .905 at most.
+    """
+    odds = features[..., FEATURES.index("place")]
+    return features[..., FEATURES.index("cost_long")] + 1.0 / (1.0 + jnp.exp(-odds))
 
 
 class Both(NamedTuple):

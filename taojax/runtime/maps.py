@@ -1,4 +1,4 @@
-"""The map, prepared once: anchors, spacing, and the grid that joint association looks up."""
+"""The map, prepared once: anchors, spacing, and the grid that the filter looks up."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,12 +14,7 @@ from taojax.errors import InputError
 from taojax.runtime.scale import LIST_SCALE, MapView, correlation_gaps, view_map
 
 NEIGHBOURS = 12
-"""Anchors pooled around each anchor."""
-
-REACH_DELTAS = 3.0
-"""A grid cell knows an anchor within so many Huber thresholds, the default ones: the tables depend
-on no setting, so that every setting may be swept under `vmap`. Support ends at 1.5 thresholds, so
-up to twice the default nothing is cut off; beyond, support ends at this reach."""
+"""Anchors that mass spreads to from each anchor."""
 
 ON_EDGES = 0.1
 """Share of anchors that one corner must serve better than the other to be preferred."""
@@ -49,9 +44,6 @@ of as many rows share compiled programs."""
 class MapTables(eqx.Module):
     """What `step` needs to know of the map; made once by `map_tables`."""
 
-    grid: AnchorGrid
-    """Anchors and their look-up tables."""
-
     spacing_m: Float[Array, ""]
     """Median distance between neighbouring anchors; the unit of all length scales."""
 
@@ -66,7 +58,7 @@ class MapTables(eqx.Module):
     """How far the map tells its own places apart, 0 to 1."""
 
     places: Places
-    """The same anchors for the filter: its unit of length needs no driving order."""
+    """The anchors and what the filter knows of them: its unit of length needs no driving order."""
 
 
 def map_spacing_m(xy: np.ndarray) -> float:
@@ -180,12 +172,10 @@ def map_tables(
     if descriptors is not None:
         view = view_map(descriptors, poses[:, :2], spacing_m)
     centred = poses[:, :2] - poses[:, :2].mean(axis=0)
-    reach = REACH_DELTAS * (float(StreamConfig().delta_spacings) * spacing_m)
     step_m, unit = gap_m(poses[:, :2]), 1.0
     if descriptors is not None:
         unit = float(np.clip(correlation_gaps(descriptors, poses[:, :2], step_m), 1.0, MOST_UNIT))
     return MapTables(
-        grid=_grid(poses, spacing_m, reach),
         places=Places(
             grid=_grid(poses, step_m, PLACES_REACH * step_m),
             gap_m=jnp.asarray(step_m, jnp.float32),

@@ -21,8 +21,8 @@ def check_refinement(
         refined: its records.
         replayed: replays the same frames with other settings.
     """
-    other = replace(config, {"refine": False, "association": "rank"})
-    closed = np.asarray(replayed(other).signals["tao_rank"], float).ravel()
+    other = replayed(replace(config, {"refine": False}))
+    closed = np.asarray(other.signals["tao_rank"], float).ravel()
     change = np.asarray(refined.signals["tao_rank"], float).ravel() - closed
     change = change / np.maximum(np.abs(closed), 1e-6)
     lower, higher = change < -SAME, change > SAME

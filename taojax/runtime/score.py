@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from taojax import __version__
-from taojax.config import Config, replace, to_toml
+from taojax.config import Config, to_toml
 from taojax.detector import foreign_map
 from taojax.errors import InputError
 from taojax.records import SealedTrack, code_digest, map_of, refuse_if_taken, write_run
@@ -25,7 +25,7 @@ from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.refined import check_refinement
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
-from taojax.runtime.stream import COMPILING, init, replay
+from taojax.runtime.stream import COMPILING, answered, init, literal, replay
 from taojax.runtime.trials import in_trials, replay_trials
 from taojax.specs import read_bytes
 from taojax.verdicts import decide
@@ -50,7 +50,7 @@ def candidates(observations: Observations) -> tuple[np.ndarray, np.ndarray]:
 def replay_log(
     config: Config, tables: MapTables, frames: Frame, *, progress: bool = False
 ) -> StreamRecord:
-    """Replay a whole log in chunks of one fixed shape.
+    """Replay the literal stream over a whole log in chunks of one fixed shape.
 
     Args:
         config: settings; only the stream part is used.
@@ -63,7 +63,8 @@ def replay_log(
     """
     n_frames = len(frames.odometry)
     frames = jax.tree.map(np.asarray, frames)
-    state, parts = init(config.stream, tables), []
+    settings = literal(config)
+    state, parts = init(settings, tables), []
     with tqdm(
         total=n_frames, unit="frame", disable=not progress, leave=False, desc=COMPILING
     ) as bar:
@@ -77,7 +78,7 @@ def replay_log(
                 ),
                 frames,
             )
-            state, records = replay(config.stream, tables, chunk, state)
+            state, records = replay(settings, tables, chunk, state)
             parts.append(jax.tree.map(lambda leaf, m=n: np.asarray(leaf)[:m], records))
             bar.set_description_str("scoring", refresh=False)
             bar.update(n)
@@ -146,7 +147,7 @@ def score(
         out: run folder to make; must be absent or empty.
         config: settings.
         calibration: frozen numbers of an earlier audit; the shipped ones when omitted.
-        rival_logs: also run the rank association and, on so many first trials (a folder without
+        rival_logs: also seal the literal track and, on so many first trials (a folder without
             trials is one), every rival; adds tracks.npz. None = neither.
         progress: draw a bar on stderr.
 
@@ -174,16 +175,17 @@ def score(
         return replay_trials(config, tables, in_trials(frames, n), progress=progress)
 
     records = replayed(config)
+    track = sealed_track(records, "tao_rank")
     seen = hindsight.clean(tables, np.asarray(observations.odometry), index, similarity)
     both = hindsight.replay_each(config.verdict, tables, seen, n, progress=progress)
     tracks = None
     if rival_logs is not None:
-        literal = replayed(replace(config, {"association": "rank"}))
         said = rival_tracks(observations, frames, most_logs=rival_logs, progress=progress)
-        tracks = {"tao_rank": sealed_track(literal, "tao_rank"), **said}
+        tracks = {"tao_rank": track, **said}
+    notes = [check_refinement(config, records, replayed)] if config.stream.refine else []
+    records = answered(config, records, both.now)
     table = signal_table(observations.t_s, records) | hindsight.now_columns(both.now)
     delayed = hindsight.delayed_columns(both.final)
-    notes = [check_refinement(config, records, replayed)] if config.stream.refine else []
     said = _Said(table, delayed, index, similarity, tables, notes, tracks)
     return _sealed(dataset, out, config, observations, calibration, said)
 

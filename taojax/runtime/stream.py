@@ -1,28 +1,32 @@
 """Causal replay: one frame in, one record out, constant memory.
 
+Every frame gets the paper's literal cost over K branches; under joint association the filter of
+`hindsight` answers beside it, and `tao` and the pose are its.
+
 tables = map_tables(poses)                      # once per map
 state = init(config)
 state, record = step(config, tables, state, frame)    # per frame
 state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from taojax.config import StreamConfig
+from taojax.config import Config, StreamConfig
 from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
 from taojax.core.history import push
 from taojax.core.procrustes import diagnose
 from taojax.core.se2 import inverse, transform
 from taojax.core.sums import least, over_frames
 from taojax.errors import InputError
-from taojax.runtime import signals
-from taojax.runtime.answer import joint_answer, joint_terms, rank_answer
+from taojax.runtime import hindsight, signals
 from taojax.runtime.frames import (
     DEGENERATE,
-    LOST,
     NO_CANDIDATES,
     OK,
     WARMING_UP,
@@ -31,23 +35,13 @@ from taojax.runtime.frames import (
     StreamRecord,
     check_frame,
 )
-from taojax.runtime.joint import JointReading, JointState, init_joint, joint_step
 from taojax.runtime.maps import MapTables
-from taojax.runtime.recursive import RecursiveState, init_recursive, recursive_step
-from taojax.runtime.scale import rescale
 
 WARM_FRAMES = 3
 """Frames seen before anything is said of a place."""
 
 COMPILING = "compiling once"
 """On a bar until the first frames are done, some 5 to 20 s: one that stands still alarms."""
-
-
-class Memory(eqx.Module):
-    """What only joint association remembers."""
-
-    joint: JointState
-    recursive: RecursiveState
 
 
 class StreamState(eqx.Module):
@@ -77,8 +71,8 @@ class StreamState(eqx.Module):
     n_seen: Int[Array, ""]
     """Frames so far; stops counting at the longest window, so that it never wraps."""
 
-    memory: Memory | None
-    """Of the joint branches; None where `tao` is the rank cost."""
+    filter: hindsight.State | None
+    """None under rank association."""
 
 
 def cost_params(config: StreamConfig, tables: MapTables) -> CostParams:
@@ -109,9 +103,21 @@ def rank_costs(
     return refined_costs(params, p, branches, weight)
 
 
-def init(config: StreamConfig, tables: MapTables) -> StreamState:
-    """Return the state before the first frame on this map."""
-    n, k = config.window, config.branches
+def _whole(config: Config | StreamConfig) -> Config:
+    return config if isinstance(config, Config) else Config(stream=config)
+
+
+def init(config: Config | StreamConfig, tables: MapTables) -> StreamState:
+    """Return the state before the first frame on this map.
+
+    Args:
+        config: settings; those of the judge change nothing, and with the stream's alone the filter
+            has its defaults.
+        tables: from `map_tables`.
+    """
+    config = _whole(config)
+    n, k = config.stream.window, config.stream.branches
+    is_joint = config.stream.association == "joint"
     return StreamState(
         p=jnp.zeros((n, 2)),
         q=jnp.zeros((n, 2, k)),
@@ -121,31 +127,8 @@ def init(config: StreamConfig, tables: MapTables) -> StreamState:
         weight=jnp.zeros(n),
         top1=jnp.zeros(max(signals.WINDOWS)),
         n_seen=jnp.zeros((), jnp.int32),
-        memory=None if config.association == "rank" else init_memory(config, tables),
+        filter=hindsight.init(config.verdict, tables) if is_joint else None,
     )
-
-
-def init_memory(config: StreamConfig, tables: MapTables) -> Memory:
-    """Return what joint association remembers before the first frame."""
-    m = tables.grid.xy.shape[0]
-    return Memory(init_joint(config, m), init_recursive(tables))
-
-
-def memory_step(
-    config: StreamConfig,
-    tables: MapTables,
-    memory: Memory,
-    odometry: Float[Array, "3"],
-    index: Int[Array, " c"],
-    similarity: Float[Array, " c"],
-) -> tuple[Memory, JointReading, dict[str, Array]]:
-    """Advance joint branches and recursive filter by one clean frame; return their columns too."""
-    scaled = rescale(tables.scale, similarity)
-    joint, reading = joint_step(config, tables, memory.joint, odometry, index, scaled)
-    belief, elsewhere = recursive_step(tables, memory.recursive, odometry, index, scaled)
-    delta_m = cost_params(config, tables).delta_m
-    terms = joint_terms(config, delta_m, tables, reading, elsewhere)
-    return Memory(joint, belief), reading, terms
 
 
 def _own_weight(frame: Frame, like: Array) -> Array:
@@ -162,7 +145,13 @@ def window_weight(given: Float[Array, " n"], is_filled: Bool[Array, " n"]) -> Fl
     return own / over_frames(own)
 
 
-def check_state(config: StreamConfig, tables: MapTables, state: StreamState) -> None:
+def _share(is_inlier: Bool[Array, " n"], is_filled: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Return the share of the filled window frames that are inliers."""
+    n_in, n = over_frames(jnp.stack([is_inlier, is_filled], axis=1).astype(jnp.float32))
+    return n_in / n
+
+
+def check_state(config: Config, tables: MapTables, state: StreamState) -> None:
     """Refuse a state of other settings or of another map.
 
     Raises:
@@ -188,20 +177,19 @@ def clean(config: StreamConfig, tables: MapTables, frame: Frame) -> tuple[Array,
     room = max(0, k - frame.index.shape[0])
     index = jnp.pad(frame.index[:k], (0, room), constant_values=-1)
     similarity = jnp.pad(frame.similarity[:k], (0, room))
-    is_there = (
-        (index >= 0) & (index < tables.grid.xy.shape[0]) & jnp.isfinite(similarity) & is_usable
-    )
+    m = tables.places.grid.xy.shape[0]
+    is_there = (index >= 0) & (index < m) & jnp.isfinite(similarity) & is_usable
     return odometry, jnp.where(is_there, index, -1), jnp.where(is_there, similarity, 0.0)
 
 
 @jax.jit
 def step(
-    config: StreamConfig, tables: MapTables, state: StreamState, frame: Frame
+    config: Config | StreamConfig, tables: MapTables, state: StreamState, frame: Frame
 ) -> tuple[StreamState, StreamRecord]:
     """Advance by one frame.
 
     Args:
-        config: fixed for the whole stream.
+        config: fixed for the whole stream, as given to `init`.
         tables: the map, from `map_tables`.
         state: from `init` or the previous `step`; same structure, shapes and dtypes come out.
         frame: one observation. NaN and rows outside the map count as missing.
@@ -215,10 +203,61 @@ def step(
             checked once, at the door, by `load_observations`.
     """
     check_frame(frame)
+    config = _whole(config)
     check_state(config, tables, state)
+    state, record = _literal(config.stream, tables, state, frame)
+    if state.filter is None:
+        return state, record
+    seen = hindsight.cleaned(tables, frame.odometry, frame.index, frame.similarity)
+    known, answer = hindsight.advance(config.verdict, tables, state.filter, seen)
+    return eqx.tree_at(lambda s: s.filter, state, known), with_answer(record, answer)
+
+
+def with_answer(record: StreamRecord, answer: hindsight.Answer) -> StreamRecord:
+    """Return records whose `tao` and pose are the filter's.
+
+    Args:
+        record: of rank branches; any leading axes.
+        answer: causal answers to the same frames.
+    """
+    # The filter's answer needs no window of its own, but nothing is said without candidates.
+    status = jnp.where(record.status == DEGENERATE, OK, record.status)
+    has_pose = status == OK
+    tao = record.signals.names.index("tao")
+    table = jnp.asarray(record.signals.table).at[..., tao].set(hindsight.tao(answer.features))
+    return StreamRecord(
+        status=status,
+        map_index=jnp.where(has_pose, answer.map_index, -1),
+        pose=jnp.where(has_pose[..., None], answer.pose, 0.0),
+        has_pose=has_pose,
+        signals=Signals(record.signals.names, table),
+    )
+
+
+def literal(config: Config) -> StreamConfig:
+    """Return the settings of the literal stream: a log's filter runs apart, with hindsight."""
+    return dataclasses.replace(config.stream, association="rank")
+
+
+def answered(config: Config, record: StreamRecord, now: hindsight.Answer) -> StreamRecord:
+    """Return what `step` says of a log, put together from a literal replay and causal answers.
+
+    Args:
+        config: settings; under rank association the records stay as they are.
+        record: from `replay` with `literal(config)`.
+        now: answers to the same frames.
+    """
+    is_rank = config.stream.association == "rank"
+    return record if is_rank else jax.tree.map(np.asarray, with_answer(record, now))
+
+
+def _literal(
+    config: StreamConfig, tables: MapTables, state: StreamState, frame: Frame
+) -> tuple[StreamState, StreamRecord]:
+    """Advance the paper's system: windows, rank branches and the signals of one view."""
     odometry, index, similarity = clean(config, tables, frame)
     is_there = index >= 0
-    anchors = jnp.where(is_there[:, None], tables.grid.xy[index], 0.0)
+    anchors = jnp.where(is_there[:, None], tables.places.grid.xy[index], 0.0)
     p = push(transform(inverse(odometry)[None], state.p), jnp.zeros(2))
     q, s = push(state.q, anchors.T), push(state.similarity, similarity)
     has_anchor = push(state.has_anchor, is_there)
@@ -241,23 +280,6 @@ def step(
     had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
     means = signals.windowed(history, n_seen)
     windowed = {f"top1_w{n}": mean for n, mean in zip(signals.WINDOWS, means, strict=True)}
-    rank_terms = {
-        "tao_rank": costs.total[cheapest],
-        "tao_rank_geom": costs.geom[cheapest],
-        "tao_rank_vel": costs.vel[cheapest],
-        "tao_rank_sim": costs.sim[cheapest],
-    }
-    if state.memory is None:
-        memory = None
-        terms = {name.replace("_rank", ""): value for name, value in rank_terms.items()}
-        terms |= {name: terms["tao"] for name in ("tao_align", "tao_window", "tao_rival")}
-        terms["recursive"] = signals.top1(similarity)
-        answer = rank_answer(costs, rank, is_filled, index[rank], has_candidates)
-    else:
-        memory, reading, terms = memory_step(
-            config, tables, state.memory, odometry, index, similarity
-        )
-        answer = joint_answer(tables, reading)
     values = {
         "top1": signals.top1(similarity),
         **windowed,
@@ -275,22 +297,23 @@ def step(
         "c_geom": shape.c_geom,
         "a_aniso": 0.0 - shape.a_aniso,
         "h_proxy": 0.0 - shape.h_proxy,
-        **terms,
-        **rank_terms,
-        "support": 1.0 - answer.share,
-        "stale": answer.stale,
+        "tao": costs.total[cheapest],
+        "tao_rank": costs.total[cheapest],
+        "tao_rank_geom": costs.geom[cheapest],
+        "tao_rank_vel": costs.vel[cheapest],
+        "tao_rank_sim": costs.sim[cheapest],
+        "support": 1.0 - _share(costs.is_inlier[:, rank], is_filled),
     }
 
     is_warm = n_seen >= WARM_FRAMES
-    has_pose = answer.is_known & is_warm
-    status = jnp.where(answer.is_lost, LOST, OK)
-    status = jnp.where(answer.is_degenerate, DEGENERATE, status)
+    has_pose = has_candidates & is_warm
+    status = jnp.where(costs.is_degenerate[rank], DEGENERATE, OK)
     status = jnp.where(has_candidates, status, NO_CANDIDATES)
     status = jnp.where(is_warm, status, WARMING_UP)
     record = StreamRecord(
         status=status,
-        map_index=jnp.where(has_pose, answer.map_index, -1),
-        pose=jnp.where(has_pose, answer.pose, 0.0),
+        map_index=jnp.where(has_pose, index[rank], -1),
+        pose=jnp.where(has_pose, costs.T_map_odom[rank], 0.0),
         has_pose=has_pose,
         signals=Signals(tuple(values), jnp.stack(list(values.values()))),
     )
@@ -303,14 +326,17 @@ def step(
         weight=given,
         top1=history,
         n_seen=n_seen,
-        memory=memory,
+        filter=state.filter,
     )
     return state, record
 
 
 @jax.jit
 def replay(
-    config: StreamConfig, tables: MapTables, frames: Frame, state: StreamState | None = None
+    config: Config | StreamConfig,
+    tables: MapTables,
+    frames: Frame,
+    state: StreamState | None = None,
 ) -> tuple[StreamState, StreamRecord]:
     """Run `step` over a whole log.
 

@@ -3,13 +3,13 @@
 What the settings share is prepared once. Rank branches do not depend on the past, so a frame's
 windows are slices of one log, a shorter window or fewer branches are masks, and the weight of the
 similarity term and the number of branches need no second fit: a *unit* of work is one fit with all
-its values of those two. A joint unit is one configuration, a scan over time.
+its values of those two. A unit of the filter is one configuration, a scan over time.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from taojax.config import StreamConfig
+from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.core.cost import Branch
 from taojax.core.se2 import inverse, transform
+from taojax.runtime import hindsight
 from taojax.runtime.frames import Frame
 from taojax.runtime.grid import Row, largest
 from taojax.runtime.maps import MapTables
-from taojax.runtime.stream import Memory, cost_params, init_memory, memory_step, rank_costs
+from taojax.runtime.stream import cost_params, rank_costs
 
 MOST_AT_ONCE = 32
 """Units under one `vmap` at most, where vmap is used at all."""
@@ -54,23 +55,17 @@ class RankUnit(eqx.Module):
     branches: Int[Array, "*u g"]
 
 
-class JointUnit(eqx.Module):
-    """One joint configuration."""
-
-    config: StreamConfig
-    window: Int[Array, "*u"]
-    seeds: Int[Array, "*u"]
-    branches: Int[Array, "*u"]
-
-
 class Unit(NamedTuple):
     """One piece of work: rows of the grid and the arguments that give their signals."""
 
     rows: tuple[int, ...]
-    arguments: RankUnit | JointUnit
+    arguments: RankUnit | VerdictConfig
 
 
-def _scalars(config: StreamConfig, row: Row, **sizes: Any) -> StreamConfig:
+_C = TypeVar("_C", StreamConfig, VerdictConfig)
+
+
+def _scalars(config: _C, row: Row, **sizes: Any) -> _C:
     """Return settings whose numbers are arrays, so that one compilation serves every row."""
     free = [f.name for f in dataclasses.fields(config) if not f.metadata.get("static", False)]
     numbers: dict[str, Any] = {
@@ -92,6 +87,7 @@ def rank_log(tables: MapTables, frames: Frame, window: int, branches: int) -> Ra
     index = jnp.pad(frames.index[:, :branches], ((0, 0), (0, room)), constant_values=-1)
     similarity = jnp.pad(frames.similarity[:, :branches], ((0, 0), (0, room)))
     is_there = index >= 0
+    anchors = tables.places.grid.xy[index]
     before = ((window - 1, 0), (0, 0))
 
     def push(p: Array, odometry: Array) -> tuple[Array, Array]:
@@ -101,7 +97,7 @@ def rank_log(tables: MapTables, frames: Frame, window: int, branches: int) -> Ra
 
     return RankLog(
         p=jax.lax.scan(push, jnp.zeros((window, 2)), frames.odometry)[1],
-        q=jnp.pad(jnp.where(is_there[..., None], tables.grid.xy[index], 0.0), (*before, (0, 0))),
+        q=jnp.pad(jnp.where(is_there[..., None], anchors, 0.0), (*before, (0, 0))),
         similarity=jnp.pad(jnp.where(is_there, similarity, 0.0), before),
         has_anchor=jnp.pad(is_there, before),
     )
@@ -126,35 +122,22 @@ def rank_signals(tables: MapTables, log: RankLog, unit: RankUnit) -> Float[Array
     return jax.lax.map(at, jnp.arange(log.p.shape[0])).T
 
 
-def joint_signals(tables: MapTables, frames: Frame, unit: JointUnit) -> Float[Array, "1 t"]:
-    """Return the signal of a stream with joint branches.
+def joint_signals(
+    tables: MapTables, seen: hindsight.Seen, config: VerdictConfig
+) -> Float[Array, "1 t"]:
+    """Return the signal of a filter.
 
     Args:
         tables: the map.
-        frames: checked at the door.
-        unit: `config` holds the sizes of the arrays. Its lists are longer than the recording's by
-            the number of seeds, because a candidate that may not seed moves behind those that may.
+        seen: from `hindsight.cleaned`.
+        config: its settings.
     """
-    config = unit.config
-    n, n_seeds, c = config.joint_window, config.joint_seeds, frames.index.shape[1]
-    place = jnp.arange(config.branches)
-    source = jnp.where(place < unit.seeds, place, place - (n_seeds - unit.seeds))
-    is_used = (place < unit.seeds) | (place >= n_seeds)
-    is_used &= (source >= 0) & (source < jnp.minimum(unit.branches, c))
-    source = jnp.where(is_used, source, 0)
 
-    def advance(memory: Memory, frame: Frame) -> tuple[Memory, Array]:
-        state = memory.joint
-        index = jnp.where(is_used, frame.index[source], -1)
-        similarity = jnp.where(index >= 0, frame.similarity[source], 0.0)
-        # Frames that leave the shorter window: the slot to be written next has age n.
-        age = jnp.mod(state.slot - jnp.arange(n) - 1, n) + 1
-        is_filled = state.is_filled & (age < unit.window)
-        kept = eqx.tree_at(lambda m: m.joint.is_filled, memory, is_filled)
-        memory, _, terms = memory_step(config, tables, kept, frame.odometry, index, similarity)
-        return memory, terms["tao"]
+    def advance(state: hindsight.State, frame: hindsight.Seen) -> tuple[hindsight.State, Array]:
+        state, answer = hindsight.advance(config, tables, state, frame)
+        return state, hindsight.tao(answer.features)
 
-    return jax.lax.scan(advance, init_memory(config, tables), frames)[1][None]
+    return jax.lax.scan(advance, hindsight.init(config, tables), seen)[1][None]
 
 
 def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
@@ -184,27 +167,13 @@ def rank_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
     return units
 
 
-def joint_units(rows: Sequence[Row], config: StreamConfig) -> list[Unit]:
-    """Return one unit per joint row of a grid."""
-    mine = {n: row for n, row in enumerate(rows) if row["association"] == "joint"}
-    if not mine:
-        return []
-    chosen = list(mine.values())
-    seeds = largest(chosen, "joint_seeds")
-    sizes = {
-        "joint_window": largest(chosen, "joint_window"),
-        "joint_seeds": seeds,
-        "branches": largest(chosen, "branches") + seeds,
-    }
+def joint_units(rows: Sequence[Row], config: VerdictConfig) -> list[Unit]:
+    """Return one unit per row of a grid that is about the filter."""
     return [
-        Unit((number,), JointUnit(
-            config=_scalars(config, row, **sizes),
-            window=jnp.asarray(int(row["joint_window"])),
-            seeds=jnp.asarray(int(row["joint_seeds"])),
-            branches=jnp.asarray(int(row["branches"])),
-        ))
-        for number, row in mine.items()
-    ]  # fmt: skip
+        Unit((number,), _scalars(config, row))
+        for number, row in enumerate(rows)
+        if row["association"] == "joint"
+    ]
 
 
 def at_once(unit: Unit, backend: str, n_anchors: int) -> int:
@@ -217,8 +186,8 @@ def at_once(unit: Unit, backend: str, n_anchors: int) -> int:
     if backend == "cpu":
         return 1
     n_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(unit.arguments))
-    if isinstance(unit.arguments, JointUnit):
-        n_bytes += unit.arguments.config.joint_window * n_anchors
+    if isinstance(unit.arguments, VerdictConfig):
+        n_bytes += 8 * n_anchors
     return max(1, min(MOST_AT_ONCE, MEMORY_BYTES // n_bytes))
 
 
@@ -254,17 +223,21 @@ def evaluate(
 
 
 def plan(
-    rows: Sequence[Row], config: StreamConfig, tables: MapTables, frames: Frame
+    rows: Sequence[Row], config: Config, tables: MapTables, frames: Frame
 ) -> list[tuple[Callable[[Any], Array], list[Unit]]]:
     """Return what to compute: per association a function of one unit, and its units."""
     work: list[tuple[Callable[[Any], Array], list[Unit]]] = []
-    if ranked := rank_units(rows, config):
+    if ranked := rank_units(rows, config.stream):
         mine = [row for row in rows if row["association"] == "rank"]
         log = rank_log(tables, frames, largest(mine, "window"), largest(mine, "branches"))
         # Refinement is another program: its units stay among themselves.
         for refine in (False, True):
-            if alike := [unit for unit in ranked if unit.arguments.config.refine == refine]:
+            alike = [
+                unit for unit in ranked if unit.rows and rows[unit.rows[0]]["refine"] == refine
+            ]
+            if alike:
                 work.append((partial(rank_signals, tables, log), alike))
-    if joint := joint_units(rows, config):
-        work.append((partial(joint_signals, tables, frames), joint))
+    if joint := joint_units(rows, config.verdict):
+        seen = hindsight.cleaned(tables, frames.odometry, frames.index, frames.similarity)
+        work.append((partial(joint_signals, tables, seen), joint))
     return work

@@ -129,7 +129,7 @@ def sweep(
     if stage(out) == "sealed":
         raise InputError(f"{out}: already holds a finished sweep; choose a new --out")
     observations = load_observations(dataset)
-    rows = grids.expand(grid, config.stream)
+    rows = grids.expand(grid, config)
     facts = facts_of(
         f"taojax sweep {dataset} --config config.toml --grid grid.toml", dataset, config.seed
     )
@@ -159,7 +159,7 @@ def sweep(
         total=len(rows), initial=len(done), unit="configuration", disable=not progress, leave=False
     )
     with bar:
-        for signals, units in plan(rows, config.stream, tables, frames):
+        for signals, units in plan(rows, config, tables, frames):
             left = [unit for unit in units if not done.issuperset(unit.rows)]
             batch = at_once(units[0], jax.default_backend(), len(poses))
             for members, found in evaluate(signals, left, batch=batch):

@@ -9,7 +9,7 @@ from taojax.config import Config, StreamConfig
 from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.maps import MapTables
 from taojax.runtime.parallel import CUT, WHOLE, device_mesh, gather, place
-from taojax.runtime.stream import replay
+from taojax.runtime.stream import literal, replay
 
 CHUNK_TRIALS = 32
 """Trials per call and device; one compilation, and a progress bar that moves."""
@@ -55,7 +55,7 @@ def replay_trials(
     mesh: Mesh | None = None,
     progress: bool = False,
 ) -> StreamRecord:
-    """Replay every trial from a fresh start, the trials shared among the devices.
+    """Replay the literal stream over every trial from a fresh start, shared among the devices.
 
     Args:
         config: settings; only the stream part is used.
@@ -81,7 +81,7 @@ def replay_trials(
             chosen = np.minimum(np.arange(start, start + width), n_trials - 1)
             n = min(width, n_trials - start)
             chunk = jax.tree.map(lambda leaf, c=chosen: np.asarray(leaf)[c], frames)
-            records = _replay_each(config.stream, tables, place(chunk, mesh, CUT), batch, mesh)
+            records = _replay_each(literal(config), tables, place(chunk, mesh, CUT), batch, mesh)
             parts.append(jax.tree.map(lambda leaf, m=n: leaf[:m], gather(records)))
             bar.update(n * n_frames)
     together = lambda *leaves: np.concatenate(leaves).reshape(-1, *leaves[0].shape[2:])

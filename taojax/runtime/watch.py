@@ -28,7 +28,7 @@ from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import descriptor_names
 from taojax.runtime.retrieval import N_KEPT
-from taojax.runtime.stream import init, step
+from taojax.runtime.stream import answered, init, literal, step
 from taojax.specs import read_npy
 from taojax.tables import POSE, read_table, stacked
 from taojax.verdicts import SILENT, judged
@@ -211,9 +211,9 @@ class Watch:
         """
         # The map stays an argument: folded into the program it compiles for longer, and rounds
         # differently from `taojax score`.
-        self._config, self._tables = config, tables
+        self._config, self._tables, self._literal = config, tables, literal(config)
         self._calibration = calibration or shipped()
-        self._n_map = tables.grid.xy.shape[0]
+        self._n_map = tables.places.grid.xy.shape[0]
         self.latencies_ms: deque[float] = deque(maxlen=REMEMBERED)
         self._start()
         # As many frames as a first block needs, so that its program is compiled too.
@@ -225,9 +225,9 @@ class Watch:
         self.latencies_ms.clear()
 
     def _start(self) -> None:
-        self._state, self._n_frames, self._n_final = init(self._config.stream, self._tables), 0, 0
+        self._state, self._n_frames, self._n_final = init(self._literal, self._tables), 0, 0
         self._follower = hindsight.Follower(self._config.verdict, self._tables)
-        self._waiting: deque[tuple[float | None, str, str, dict[str, float]]] = deque()
+        self._waiting: deque[tuple[float | None, str, str]] = deque()
 
     def answer(self, line: bytes) -> list[dict[str, Any]]:
         """Take in one line; say what it means, and what is final now of earlier ones.
@@ -240,7 +240,7 @@ class Watch:
         start = time.perf_counter()
         seen = parse(line, self._n_map)
         frame = Frame(*(jnp.asarray(leaf) for leaf in seen[1:]))
-        self._state, record = step(self._config.stream, self._tables, self._state, frame)
+        self._state, record = step(self._literal, self._tables, self._state, frame)
         clean = hindsight.clean(
             self._tables, seen.odometry[None], seen.rows[None], seen.similarity[None]
         )
@@ -259,16 +259,12 @@ class Watch:
     def _said(
         self, t_s: float | None, record: StreamRecord, now: hindsight.Answer
     ) -> dict[str, Any]:
+        record = answered(self._config, record, now)
         status = STATUSES[int(record.status)]
-        row = {name: float(value) for name, value in record.signals.items()}
         one = jax.tree.map(lambda leaf: leaf[None], now)
         columns = hindsight.now_columns(one)
-        verdict, why, p = judged(
-            self._calibration.now,
-            columns | {name: np.array([value]) for name, value in row.items()},
-            np.array([status], dtype=object),
-        )
-        self._waiting.append((t_s, status, str(verdict[0]), row))
+        verdict, why, p = judged(self._calibration.now, columns, np.array([status], dtype=object))
+        self._waiting.append((t_s, status, str(verdict[0])))
         return {
             "kind": "now",
             "frame": self._n_frames,
@@ -278,7 +274,7 @@ class Watch:
             "map_index": int(now.map_index) if status not in SILENT else -1,
             "pose": [short(v) for v in now.pose.tolist()] if status not in SILENT else None,
             "probability_wrong": short(float(p[0])),
-            "tao": short(row["tao"]),
+            "tao": short(float(record.signals["tao"])),
             "reason": str(why[0]),
         }
 
@@ -290,7 +286,7 @@ class Watch:
             before = [self._waiting.popleft() for _ in range(n)]
             status = np.array([one[1] for one in before], dtype=object)
             verdict, why, p = judged(self._calibration.final, columns, status)
-            for at, (t_s, said, verdict_now, _) in enumerate(before):
+            for at, (t_s, said, verdict_now) in enumerate(before):
                 is_known = said not in SILENT
                 pose = [short(float(columns[name][at])) for name in POSE]
                 lines.append({

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Explain:
-    """Say why a frame got its verdict: signal, branch, disagreeing frames, margin, picture.
+    """Say why a frame got its verdict: its path, disagreeing frames, other places, margin, picture.
 
     Example: taojax explain runs/mine --frame 812
     """
@@ -32,11 +32,11 @@ class Explain:
     """Where to write frame_N.png, .svg and .csv."""
 
     progress: bool = True
-    """Draw progress bars."""
+    """Changes nothing: the answer is there at once."""
 
 
 def run(args: Explain) -> None:
-    """Replay up to the frame, tell and draw."""
+    """Follow the answer once more, tell and draw."""
     from taojax.closures import read_verdicts
     from taojax.records import read_run
     from taojax.runtime.explain import explain
@@ -44,7 +44,7 @@ def run(args: Explain) -> None:
 
     sealed = read_run(args.run)
     verdicts = read_verdicts(args.run, sealed)
-    look = explain(args.run, sealed, args.frame, progress=args.progress)
+    look = explain(args.run, sealed, args.frame)
     if look.gap > 1.0:
         _refuse(args.run, sealed, look)
     print("\n".join(page(look, sealed, verdicts)))
@@ -54,15 +54,15 @@ def run(args: Explain) -> None:
 
 
 def _refuse(folder: Path, sealed: "Run", look: "Look") -> None:
-    """Stop where the replay does not give what was sealed."""
+    """Stop where the path does not cost what was sealed."""
     from taojax.runtime.score import facts_of
 
     here = facts_of("", folder, 0)
     names = [name for name in ("device", "versions", "code") if sealed.manifest[name] != here[name]]
     differs = f"here differ {', '.join(names)}" if names else "device, versions and code are equal"
     say(
-        f"taojax: {folder}: frame {look.frame} replayed gives tao {look.signals['tao']:.6g} where "
-        f"{look.sealed['tao']:.6g} is sealed, so nothing can be explained ({differs}); score again"
+        f"taojax: {folder}: the path of frame {look.frame} costs {look.cost:.6g} where "
+        f"{look.sealed:.6g} is sealed, so nothing can be explained ({differs}); score again"
     )
     raise SystemExit(1)
 
@@ -78,12 +78,12 @@ def _draw(stem: Path, sealed: "Run", look: "Look", headline: str) -> None:
     from taojax.window_plot import WindowMarks, draw_window
 
     map_m = np.stack([sealed.map_poses[c] for c in ("x_m", "y_m")], axis=1)
-    window, branches = look.window, look.branches
+    window, found = look.window, look.hypotheses
     has = (window.anchor >= 0)[:, None]
     anchor_m = np.where(has, map_m[np.maximum(window.anchor, 0)], np.nan)
     marks = WindowMarks(
         map_m, window.path_m, anchor_m, window.is_inlier, map_m[look.candidate],
-        branches.pose.astype(float), branches.cost.astype(float),
+        found.pose, found.cost,
     )  # fmt: skip
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -105,19 +105,19 @@ def _draw(stem: Path, sealed: "Run", look: "Look", headline: str) -> None:
 
 
 def _rows(look: "Look", map_m: "np.ndarray", anchor_m: "np.ndarray") -> "dict[str, np.ndarray]":
-    """Return the columns of data_specs/explain.toml: frames, then candidates, then branches."""
+    """Return the columns of data_specs/explain.toml: frames, then candidates, then places."""
     import numpy as np
 
-    window, branches = look.window, look.branches
-    n, c, k = len(window.frame), len(look.candidate), len(branches.cost)
+    window, found = look.window, look.hypotheses
+    n, c, k = len(window.frame), len(look.candidate), len(found.cost)
     # One column from its part of each kind; None is blank.
     joined = lambda *parts: np.concatenate(
         [np.full(size, np.nan) if part is None else np.asarray(part, float)
          for part, size in zip(parts, (n, c, k), strict=True)]
     )  # fmt: skip
-    candidate_m, pose = map_m[look.candidate], branches.pose
+    candidate_m, pose = map_m[look.candidate], found.pose
     return {
-        "kind": np.array(["frame"] * n + ["candidate"] * c + ["branch"] * k, dtype=object),
+        "kind": np.array(["frame"] * n + ["candidate"] * c + ["place"] * k, dtype=object),
         "number": joined(window.frame, np.arange(1, c + 1), np.arange(1, k + 1)),
         "x_m": joined(window.path_m[:, 0], candidate_m[:, 0], pose[:, 0]),
         "y_m": joined(window.path_m[:, 1], candidate_m[:, 1], pose[:, 1]),
@@ -125,7 +125,7 @@ def _rows(look: "Look", map_m: "np.ndarray", anchor_m: "np.ndarray") -> "dict[st
         "map_index": joined(window.anchor, look.candidate, None),
         "map_x_m": joined(anchor_m[:, 0], candidate_m[:, 0], None),
         "map_y_m": joined(anchor_m[:, 1], candidate_m[:, 1], None),
-        "cost": joined(window.cost, None, branches.cost),
+        "cost": joined(window.cost, None, found.cost),
         "weight": joined(window.weight, None, None),
         "similarity": joined(None, look.similarity, None),
         "agrees": joined(window.is_inlier, None, None),

@@ -18,7 +18,10 @@ WIDTH = 92
 LABEL = 10
 
 N_COSTS = 12
-"""Frame costs printed one by one, newest first."""
+"""Frame costs printed one by one."""
+
+AMBIGUOUS = 0.1
+"""Another place whose path costs so little more could as well be the right one."""
 
 
 def page(look: "Look", run: "Run", verdicts: "Verdicts | None") -> list[str]:
@@ -35,14 +38,12 @@ def page(look: "Look", run: "Run", verdicts: "Verdicts | None") -> list[str]:
         ("now", _now(look, verdicts)),
         ("decided by", _decided(look, run, verdicts)),
         ("promise", "" if verdicts is None else verdicts.calibration.final.promise),
-        ("tao", _tao(look)),
         ("place", _place(look)),
-        ("branch", _branch(look)),
         ("window", _window(look)),
         ("costs", _costs(look)),
-        ("support", _support(look)),
         ("rival", _rival(look)),
-        ("list", _list(look)),
+        ("literal", _literal(look, run)),
+        ("list", _list(look, run)),
         ("margin", _margin(look, run, verdicts)),
     ]
     lines = []
@@ -57,9 +58,8 @@ def page(look: "Look", run: "Run", verdicts: "Verdicts | None") -> list[str]:
 
 def headline(look: "Look", verdicts: "Verdicts | None") -> str:
     """Return one line over the picture."""
-    said = f"frame {look.frame}: {look.status}, tao {look.signals['tao']:.3f}"
     if verdicts is None:
-        return said
+        return f"frame {look.frame}: {look.status}, path cost {look.cost:.3f}"
     said = f"frame {look.frame}: {verdicts.verdict[look.frame]}"
     said += "" if look.status == "ok" else f", {look.status}"
     p, level = verdicts.probability[look.frame], verdicts.calibration.final.level
@@ -69,11 +69,11 @@ def headline(look: "Look", verdicts: "Verdicts | None") -> str:
 
 def _frame(look: "Look", run: "Run") -> str:
     n, t_s = len(run.signals["frame"]), run.signals["t_s"][look.frame]
-    difference = abs(look.signals["tao"] - look.sealed["tao"])
-    how = "bit for bit" if difference == 0 else f"to {difference:.1g}"
+    difference = abs(look.cost - look.sealed)
+    how = "to nine digits" if difference < 1e-9 else f"to {difference:.1g}"
     return (
-        f"{look.frame} of 0 to {n - 1} (t = {float(t_s):.10g} s); the seal holds, and the replay "
-        f"gives the sealed tao {how}"
+        f"{look.frame} of 0 to {n - 1} (t = {float(t_s):.10g} s); the seal holds, and the path "
+        f"followed again costs what was sealed {how}"
     )
 
 
@@ -124,44 +124,15 @@ def _terms(risk: "Risk", look: "Look", run: "Run") -> dict[str, float]:
     return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
 
 
-def _tao(look: "Look") -> str:
-    s = look.signals
-    if look.unit == "m^2":
-        return (
-            f"{s['tao']:.4g} m^2 (rank association) = residuals {s['tao_geom']:.4g} + velocity "
-            f"{s['tao_vel']:.4g} + similarity {s['tao_sim']:.4g}"
-        )
-    missing = max(0.0, s["tao_window"] - s["tao_geom"] - s["tao_sim"])
-    return (
-        f"{s['tao']:.3f} = alignment {s['tao_align']:.3f} + recursive filter "
-        f"{s['tao'] - s['tao_align']:.3f} (it doubts its place with {s['recursive']:.3f}); over "
-        f"the whole window {s['tao_window']:.3f} = residuals {s['tao_geom']:.3f} + similarity "
-        f"{s['tao_sim']:.3f} + frames without support and turn {missing:.3f}"
-    )
-
-
 def _pose(pose: np.ndarray) -> str:
     return f"x = {pose[0]:.2f} m, y = {pose[1]:.2f} m, {np.degrees(pose[2]):.0f} degrees"
 
 
 def _place(look: "Look") -> str:
     if look.map_index < 0:
-        return "none: no pose is reported"
-    gap = np.hypot(*(look.pose[:2] - look.branches.pose[0, :2]))
-    return f"map row {look.map_index}, robot at {_pose(look.pose)}; {gap:.1f} m from branch 1, " + (
-        "because a jump was noticed" if look.status == "lost" else "known from newer frames"
-    )
-
-
-def _branch(look: "Look") -> str:
-    b = look.branches
-    if not len(b.cost):
-        return "none: no hypothesis at all"
-    told = [f"1: cost {b.cost[0]:.3g}, started from {b.source[0]}, at {_pose(b.pose[0])}"]
-    for number in range(1, len(b.cost)):
-        away = np.hypot(*(b.pose[number, :2] - b.pose[0, :2]))
-        told.append(f"{number + 1}: cost {b.cost[number]:.3g}, {away:.0f} m away")
-    return "; ".join(told)
+        return "none: nothing is answered"
+    pose = look.hypotheses.pose[0]
+    return f"map row {look.map_index}, robot at {_pose(pose)}; its path costs {look.cost:.3f}"
 
 
 def ranges(numbers: list[int]) -> str:
@@ -177,62 +148,57 @@ def ranges(numbers: list[int]) -> str:
 
 def _window(look: "Look") -> str:
     w = look.window
+    span = f"frames {w.frame[0]} to {w.frame[-1]}"
     against = sorted(int(frame) for frame in w.frame[~w.is_inlier])
     share = float(w.weight[~w.is_inlier].sum())
     if not against:
-        return f"all of its {len(w.frame)} frames agree with branch 1"
+        return f"{span}; all of these {len(w.frame)} agree"
     return (
-        f"{len(against)} of its {len(w.frame)} frames disagree{'s' * (len(against) == 1)} with "
-        f"branch 1, with {share:.0%} of the weight: {ranges(against)}"
+        f"{span}; {len(against)} of these {len(w.frame)} disagree{'s' * (len(against) == 1)}, "
+        f"with {share:.0%} of the weight: {ranges(against)}"
     )
 
 
 def _costs(look: "Look") -> str:
-    costs = " ".join(f"{cost:.2f}" for cost in look.window.cost[:N_COSTS])
-    unit = "" if look.unit == "1" else f" {look.unit}"
-    tail = ", at most that" if look.unit == "1" else ""
+    w = look.window
+    near = np.argsort(np.abs(w.frame - look.frame), kind="stable")[:N_COSTS]
+    costs = " ".join(f"{cost:.2f}" for cost in w.cost[np.sort(near)])
     return (
-        f"of the newest frames on branch 1, newest first: {costs}{unit}; a frame without support "
-        f"costs {look.no_support:.3g}{unit}{tail}"
+        f"of the {len(near)} nearest frames on the path, in order: {costs}; a frame without "
+        "support costs 1"
     )
-
-
-def _support(look: "Look") -> str:
-    stale = int(look.signals["stale"])
-    if stale == 0:
-        return "this frame itself supports the reported place"
-    if stale >= len(look.window.frame):
-        return "no frame of the window supports the reported place"
-    last = f"frame {look.frame - stale}, {stale} before, is the last that does"
-    return f"this frame does not support the reported place; {last}"
 
 
 def _rival(look: "Look") -> str:
-    s = look.signals
-    if look.unit == "m^2":
-        b = look.branches
-        if len(b.cost) < 2:
-            return "no branch lies at another place"
-        more = b.cost[1] - b.cost[0]
-        return f"the cheapest branch elsewhere costs {b.cost[1]:.4g} m^2, {more:.4g} more"
-    if s["tao_rival"] >= look.no_support:
-        return "no place elsewhere is supported at all"
+    cost, pose = look.hypotheses
+    if len(cost) < 2:
+        return "no candidate at another place finds any support"
+    told = []
+    for number in range(1, len(cost)):
+        away = np.hypot(*(pose[number, :2] - pose[0, :2]))
+        told.append(f"{number + 1}: cost {cost[number]:.3f}, {away:.0f} m away")
+    gap = cost[1:].min() - cost[0]
+    judged = "cheaper" if gap < 0 else "ambiguous" if gap < AMBIGUOUS else "clearly worse"
+    return f"{'; '.join(told)}: {judged}"
+
+
+def _literal(look: "Look", run: "Run") -> str:
+    at = lambda name: float(run.signals[name][look.frame])
     return (
-        f"the cheapest place elsewhere costs {s['tao_rival']:.3f}, "
-        f"{s['tao_rival'] - s['tao_window']:.3f} more than branch 1: "
-        + ("ambiguous" if s["tao_rival"] - s["tao_window"] < 0.1 else "clearly worse")
+        f"the paper's cost, up to this frame, tao_rank {at('tao_rank'):.4g} m^2 = residuals "
+        f"{at('tao_rank_geom'):.4g} + velocity {at('tao_rank_vel'):.4g} + similarity "
+        f"{at('tao_rank_sim'):.4g}"
     )
 
 
-def _list(look: "Look") -> str:
+def _list(look: "Look", run: "Run") -> str:
     n = len(look.candidate)
     if not n:
         return "no candidates"
-    most = np.log(n)
+    most, entropy = np.log(n), float(run.signals["entropy"][look.frame])
     return (
-        f"{n} candidates, best similarity {look.similarity[0]:.3f}, entropy "
-        f"{look.signals['entropy']:.2f} of at most {most:.2f} nat; this map tells "
-        f"{look.map_recall:.0%} of its own places apart"
+        f"{n} candidates, best similarity {look.similarity[0]:.3f}, entropy {entropy:.2f} of at "
+        f"most {most:.2f} nat; this map tells {look.map_recall:.0%} of its own places apart"
     )
 
 

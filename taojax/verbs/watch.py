@@ -66,7 +66,7 @@ def run(args: Watch) -> None:
     say("compiling for some 5 to 20 s")
     start = time.perf_counter()
     watcher = Watcher(config, loaded.tables, used)
-    say(f"ready: map of {len(loaded.tables.grid.xy)} places, {loaded.scale}; "
+    say(f"ready: map of {len(loaded.tables.places.grid.xy)} places, {loaded.scale}; "
         f"compiled in {time.perf_counter() - start:.1f} s")  # fmt: skip
     try:
         watcher.run(sys.stdin.buffer, _write)
