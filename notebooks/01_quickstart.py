@@ -58,10 +58,10 @@ for motion, rows, values in zip(odometry, index, similarity, strict=True):
 # %%
 last = records[100]
 print(STATUSES[int(last.status)], np.round(np.asarray(last.pose), 2), int(last.map_index))
-{name: round(float(last.signals[name]), 3) for name in ("top1", "tao", "recursive", "stale")}
+{name: round(float(last.signals[name]), 3) for name in ("top1", "tao", "tao_rank", "support")}
 
 # %% [markdown]
-# `tao`, cost of the best alignment and disbelief of the recursive filter, against the truth, which
+# `tao`, cost along the path of the filter's answer and doubt of its place, against the truth, which
 # only this picture knows (grey: the nearest map image is more than 10 m away).
 
 # %%

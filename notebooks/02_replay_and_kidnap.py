@@ -17,17 +17,17 @@
 # robot is carried elsewhere again and again, and its odometry does not notice.
 
 # %%
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from taojax import STATUSES, Config, Frame, map_tables
+from taojax import STATUSES, Config, Frame, map_tables, replay
 from taojax.audit.recovery import frames_to_recovery
 from taojax.datasets.kidnap import Plan, make_logs
 from taojax.datasets.kidnap_folder import world_source
 from taojax.datasets.simulate import WorldConfig
 from taojax.runtime.retrieval import retrieve
-from taojax.runtime.trials import replay_trials
 
 # %% [markdown]
 # Logs are spliced from stretches of the simulated query drive. Into the first frame of a stretch
@@ -44,13 +44,13 @@ rows = np.stack([log.rows for log in logs])
 odometry = jnp.asarray(np.stack([log.odometry for log in logs]), jnp.float32)
 frames = Frame(odometry, jnp.asarray(index[rows]), jnp.asarray(similarity[rows]))
 tables = map_tables(source.map_poses[:, 1:], descriptors=source.map_views)
-records = replay_trials(Config(), tables, frames)
+_, records = jax.vmap(lambda log: replay(Config(), tables, log))(frames)
 
 # %% [markdown]
 # How long until the pose is within 10 m of the truth and stays there for ten frames?
 
 # %%
-pose = records.pose.reshape(*rows.shape, 3)
+pose = np.asarray(records.pose)
 error = np.hypot(*np.moveaxis(pose[..., :2] - source.query_poses[rows][..., 1:3], -1, 0))
 found = []
 for log, distance in zip(logs, error, strict=True):
@@ -60,13 +60,12 @@ for log, distance in zip(logs, error, strict=True):
 print(f"{np.isfinite(found).mean():.0%} of {len(found)} recovered, median {np.median(found):.0f}")
 
 # %% [markdown]
-# Between the jump and the recovery nothing may be believed: either the newest frame does not
-# support the place (`stale`), or the status says `lost`. The first log, with its jumps dashed:
+# Between the jump and the recovery nothing may be believed: the frames do not fit on the path of the
+# old answer, and `tao` is high. The first log, with its jumps dashed:
 
 # %%
-status = np.array(STATUSES)[records.status.reshape(rows.shape)]
-stale = records.signals["stale"].reshape(rows.shape)
-believed = (status == "ok") & (stale == 0)
+status = np.array(STATUSES)[np.asarray(records.status)]
+believed = (status == "ok") & (np.asarray(records.signals["tao"]) < 0.5)
 figure, ax = plt.subplots(figsize=(9, 3), layout="constrained")
 ax.semilogy(error[0] + 0.1, color="#0072B2", linewidth=1.0)
 ax.plot(np.flatnonzero(believed[0]), error[0][believed[0]] + 0.1, ".", color="#009E73")

@@ -16,8 +16,8 @@
 # Two simulated worlds with the same road and the same deleted map segments. In the first the
 # similarity *level* separates: what is off the map looks like nothing in it. In the second places
 # alias: what is off the map looks exactly like somewhere else. A similarity gate can only work in
-# the first. Aligned evidence (`tao`) and the recursive filter work in both, as long as the odometry
-# disagrees with the alias.
+# the first. The path of the filter's answer (`tao`) works in both, as long as the odometry disagrees
+# with the alias.
 
 # %%
 import jax.numpy as jnp
@@ -26,13 +26,12 @@ import numpy as np
 import pandas as pd
 from sklearn.metrics import roc_auc_score
 
-from taojax import Config, Frame, map_tables
+from taojax import Config, Frame, map_tables, replay
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world
 from taojax.runtime.retrieval import retrieve
-from taojax.runtime.score import replay_log
 
-SIGNALS = ("top1", "top1_w10", "tao_rank", "tao", "recursive")
+SIGNALS = ("top1", "top1_w10", "tao_rank", "tao")
 
 
 # %%
@@ -40,7 +39,7 @@ def replayed(world):
     found = retrieve(world.map_descriptors, world.query_descriptors)
     tables = map_tables(world.map_poses[:, 1:], descriptors=world.map_descriptors)
     odometry = jnp.asarray(world.odometry[:, 1:], jnp.float32)
-    return replay_log(Config(), tables, Frame(odometry, *(jnp.asarray(a) for a in found)))
+    return replay(Config(), tables, Frame(odometry, *(jnp.asarray(a) for a in found)))[1]
 
 
 # %%
@@ -72,7 +71,7 @@ scores.round(3)
 
 # %% [markdown]
 # The same as a picture: grey is off the map. Where places alias, the similarity does not move when
-# the robot leaves the map; the cost of the best alignment does.
+# the robot leaves the map; the cost along the path does.
 
 # %%
 figure, axes = plt.subplots(2, 2, figsize=(9, 6), sharex=True, layout="constrained")

@@ -185,8 +185,8 @@ print(*found.sentences, sep="\n")
 
 # %% [markdown]
 # `read_run` hands out all tables of a run folder, whoever wrote it, as pandas: `signals`, `labels`
-# and `verdicts` by frame, `metrics` by signal. The similarity gates, the literal cost and the joint
-# cost, over all labelled frames:
+# and `verdicts` by frame, `metrics` by signal. The similarity gates, the literal cost and `tao`,
+# over all labelled frames:
 
 # %%
 run = read_run("run")

@@ -34,7 +34,8 @@ def made_up(name="cost", middle=0.5, gain=8.0, **changes):
     one, share = np.ones(1), np.array([0.05])
     now = Risk(("now_" + name,), middle * one, one, gain * one, 0.0, share, 0.3 * one, 0.05,
                "made up")  # fmt: skip
-    return Calibration(now, now._replace(columns=(name,)), **changes)
+    final = now._replace(columns=(name,))
+    return Calibration(now, final, **{"map_out": shipped().map_out} | changes)
 
 
 def features(columns, is_wrong, rng, numbers):
@@ -84,7 +85,7 @@ def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulat
     signals |= {"x_m": answer[:, 0], "y_m": answer[:, 1], "theta_rad": np.zeros(n)}
     for number, name in enumerate(records.signal_names()):
         signals[name] = rng.normal(0, 1, n) + (0.3 * (number % 8)) * is_out
-    signals["tao"] = signals["tao_geom"] + signals["tao_vel"] + signals["tao_sim"] + 4.0 * is_out
+    signals["tao"] += 4.0 * is_out
     is_wrong = np.hypot(*(answer - truth).T) > config().audit.wrong_m
     now, delayed = answered(answer, index[:, 0], is_wrong, rng)
     blank = np.full((len(map_m), 2), 0.0)

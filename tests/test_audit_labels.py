@@ -11,13 +11,14 @@ import taojax
 from taojax.audit import calibration, labels, metrics
 from taojax.audit.truth import read_truth
 from taojax.errors import InputError
+from taojax.risk import shipped
 
 HEADER = "t_s,x_m,y_m,theta_rad\n"
 
 
 def cut(n=20, gap=3, share=0.5):
     label = np.where(np.arange(n) % 4 == 3, "map_out", "in_map")
-    signals = {name: np.arange(float(n)) for name in calibration.DISTINCT}
+    signals = {name: np.arange(float(n)) for name in ("tao", *shipped().map_out.columns)}
     return labels.split_frames(signals, label, calibration_share=share, gap_frames=gap)
 
 
@@ -55,7 +56,7 @@ def test_a_run_shorter_than_the_gap_has_no_test_frames():
 def test_fitting_functions_refuse_a_test_split():
     splits = cut()
     with pytest.raises(TypeError):
-        calibration.fit(splits.test)
+        calibration.fit(splits.test, shipped().map_out)
     with pytest.raises(TypeError):
         calibration.sigma_threshold(splits.test, "tao", 3.0)
 

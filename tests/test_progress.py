@@ -207,7 +207,7 @@ def test_the_unit_of_a_row_changes_no_verdict_and_no_dimensionless_signal(runs):
     rows, metres = runs[1.0], runs[5.0]
     np.testing.assert_array_equal(rows.label, metres.label)
     np.testing.assert_array_equal(rows.verdicts["verdict"], metres.verdicts["verdict"])
-    for name in ("tao", "tao_align", "tao_window", "tao_rival", "recursive"):
+    for name in ("tao", "now_cost", "now_vote", "now_off_map"):
         np.testing.assert_allclose(rows.signals[name], metres.signals[name], atol=1e-4)
 
 

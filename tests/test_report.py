@@ -102,11 +102,11 @@ def test_every_name_in_tables_figures_and_panel_is_in_the_glossary(case, held):
     page = _Seen()
     page.feed(html)
     panel = {"value", "log odds", "rank", "map row", "similarity", "from truth", "own threshold"}
-    assert {"decided", "far_at_95", "top1_w5", "tao_window", "auroc"} <= page.columns
+    assert {"decided", "far_at_95", "top1_w5", "tao_rank", "auroc"} <= page.columns
     assert page.columns - panel - page.defined == set()
     shown = {signal["name"] for signal in held[2]["signals"]}
     shown |= {*figures.TRACED, *figures.STRICT, *done.judgement.detector.columns}
-    assert {"tao_rival", "recursive", "entropy", "fused"} <= shown
+    assert {"tao_rank_vel", "entropy", "fused"} <= shown
     assert shown - page.defined == set()
     assert all(len(page.terms[name]) > 8 for name in shown)
     # Names that stand in a sentence, a reason or a definition.
@@ -262,7 +262,7 @@ def test_text_of_a_run_cannot_end_the_script_that_holds_it(held):
 
 def test_a_run_that_is_never_judged_still_has_a_route(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "draw", lambda judgement: ())
-    run, truth = judged.seal(tmp_path, n=60, status="lost")
+    run, truth = judged.seal(tmp_path, n=60, status="degenerate")
     evaluate(run, truth, judged.config(r_in_m=1e-6, r_out_m=1e-5))
     assert 'id="route-data"' in (run / "report.html").read_text()
 

@@ -80,7 +80,7 @@ def drop_hash(run, home):
 
 
 def mend_hash_but_not_seal(run, home):
-    edit_text("signals.csv", "ok", "lost")(run, home)
+    edit_text("signals.csv", "ok", "gone")(run, home)
     manifest = json.loads((run / "manifest.json").read_text())
     manifest["sha256"]["signals.csv"] = records.digest_file(run / "signals.csv")
     (run / "manifest.json").write_text(json.dumps(manifest))
@@ -98,7 +98,7 @@ def link_away(run, home):
 
 
 ATTACKS = {
-    "a signal is edited": (edit_text("signals.csv", ",ok,", ",lost,"), "signals.csv: seal broken"),
+    "a signal is edited": (edit_text("signals.csv", ",ok,", ",gone,"), "signals.csv: seal broken"),
     "a row is cut": (edit_text("signals.csv", "\n7,", "\n"), "signals.csv: seal broken"),
     "the answers are edited": (edit_answers, "retrievals.npz: seal broken"),
     "a pickle replaces the answers": (pickle_in, "retrievals.npz: seal broken"),
