@@ -28,6 +28,8 @@ __all__ = ["Images", "images_of", "key_of", "map_session", "query_session"]
 UNIT_OF = {10: "s", 13: "ms", 16: "us", 19: "ns"}
 """Unit of a UNIX time of so many digits, from 2001 to 2286."""
 
+TIMED = "images were taken when their names say, in UNIX time"
+
 FIX = "store one row per image in the order of their names, or name images by their UNIX time"
 
 
@@ -87,8 +89,8 @@ def map_session(images: Images, poses: Path, reading: Reading, matching: Matchin
     if images.t_s is not None and drive.has_stamps:
         covered = pose_at(drive.poses, images.t_s, matching.gate_s)[1].mean()
         if covered >= matching.least or not _is_row_by_row(drive, images):
-            frames = images.names, images.t_s
-            return matched_session(images.folder, frames, drive.poses, matching, drive.notes)
+            frames, notes = (images.names, images.t_s), (*drive.notes, TIMED)
+            return matched_session(images.folder, frames, drive.poses, matching, notes)
     _check_row_by_row(drive, images, poses)
     return session_of(drive, images.names)
 
@@ -112,7 +114,7 @@ def query_session(images: Images, motion: Motion) -> Session | None:
     if images.t_s is None:
         return None
     unknown = Trajectory(images.t_s, np.zeros((len(images.t_s), 3)))
-    return Session(images.names, unknown, has_pose=False)
+    return Session(images.names, unknown, False, (TIMED,))
 
 
 def _is_row_by_row(drive: Drive, images: Images) -> bool:

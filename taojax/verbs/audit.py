@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.errors import UsageError
+from taojax.errors import InputError, UsageError
 from taojax.verbs.common import (
     SCENARIOS,
     Common,
@@ -130,8 +130,8 @@ def _audit_images(args: Audit, out: Path, config: "Config") -> None:
     if not (out / "manifest.json").is_file():
         refuse_if_taken(out)
     data, truth_csv = make(args.images, out.parent / FOLDER, progress=args.progress)
-    if not is_sealed(out, data, config):
-        refuse_if_taken(out)
+    if (out / "manifest.json").is_file() and not is_sealed(out, data, config):
+        raise InputError(f"{out}: holds a run of other images, files or flags; choose a new --out")
     score_apart([Scoring(data, out)], config, progress=args.progress)
     if truth_csv is None:
         say("nothing is judged: no --truth; the calibration that ships with taojax decided")
