@@ -44,7 +44,7 @@ def tum(path, t_s, poses):
 
 
 def write_street(folder):
-    """Number the map's images, name the query's by nanoseconds, and let odometry run twice as fast."""
+    """Number the map's images, name the query's by nanoseconds, let odometry run twice as fast."""
     rng = np.random.default_rng(5)
     photograph(folder / "day", [f"{k:04d}" for k in range(N_MAP)], STEP_PX * np.arange(N_MAP), 1)
     share = np.arange(N_QUERY) / N_QUERY

@@ -11,6 +11,7 @@ cv2 = pytest.importorskip("cv2", reason="needs the extra images: pip install 'ta
 from conftest import loop  # noqa: E402
 from street import N_MAP, N_QUERY, T_S, model, photograph, tum, write_street  # noqa: E402
 
+from taojax.audit import figures  # noqa: E402
 from taojax.cli import main  # noqa: E402
 from taojax.datasets.from_images import images_of, map_session  # noqa: E402
 from taojax.datasets.reading import PLAIN  # noqa: E402
@@ -64,7 +65,11 @@ def test_without_truth_the_shipped_calibration_decides(scored):
     assert not (data / "truth").exists()
 
 
-def test_truth_changes_no_byte_of_what_was_scored_and_nothing_is_made_twice(street, scored, capfd):
+def test_truth_changes_no_byte_of_what_was_scored_and_nothing_is_made_twice(
+    street, scored, capfd, monkeypatch
+):
+    # Pictures take most of the time; one is enough for the page.
+    monkeypatch.setattr(figures, "draw", lambda judgement: (figures.retrieval(judgement),))
     before, out = made(scored.parent), scored.with_name("judged")
     asked = [*words(street, out, truth=street / "truth.tum"), *RADII]
     assert main(asked) == 0
@@ -82,7 +87,7 @@ def test_truth_changes_no_byte_of_what_was_scored_and_nothing_is_made_twice(stre
 
 def test_other_flags_do_not_touch_a_run(street, scored, capsys):
     sealed = (scored / "manifest.json").read_bytes()
-    assert main([*words(street, scored), "--clahe", "3"]) == 3
+    assert main([*words(street, scored), "--clahe", "0"]) == 3
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.endswith("holds a run of other images, files or flags; choose a new --out")
     assert (scored / "manifest.json").read_bytes() == sealed
@@ -211,11 +216,11 @@ def test_images_named_by_time_find_poses_of_any_rate(tmp_path):
 @pytest.mark.parametrize(("name", "seconds"), [
     ("1600000000", 1.6e9), ("1600000000.5", 1600000000.5), ("1600000000500", 1600000000.5),
     ("1600000000500000", 1600000000.5), ("1600000000500000000", 1600000000.5),
-    ("0001", None), ("image_1600000000", None), ("16000000005.5", None),
+    ("1001", None), ("1_1600000000", None), ("16000000005.5", None),
 ])  # fmt: skip
 def test_names_that_are_unix_times_are_read_as_such(name, seconds, tmp_path):
-    for other in (name, "9999999999999999998", "9999999999999999999") if seconds else (name, 8, 9):
-        (tmp_path / f"{other}.png").write_bytes(b"x")
+    for first in "189":
+        (tmp_path / f"{first}{name[1:]}.png").write_bytes(b"x")
     t_s = images_of(tmp_path).t_s
     assert (t_s is None) if seconds is None else (t_s[0] == seconds)
 
