@@ -140,5 +140,5 @@ def key_of(said: object, places: Iterable[Path]) -> str:
         file for place in places
         for file in (sorted(place.rglob("*")) if place.is_dir() else [place]) if file.is_file()
     ]  # fmt: skip
-    states = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr((said, states, code_digest())).encode()).hexdigest()[:12]

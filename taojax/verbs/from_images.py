@@ -115,7 +115,7 @@ def make(flags: FromImages, folder: Path, *, progress: bool) -> Made:
         _described(side, images.folder, folder, flags, progress=progress)
         for side, images in zip(("map", "query"), sides, strict=True)
     )
-    said = dataclasses.replace(flags, truth=None)
+    said = [getattr(flags, field.name) for field in dataclasses.fields(Formats)]
     files = [map_poses, odometry, *views, *([flags.times] if flags.times else [])]
     data = folder / f"data-{key_of(said, files)}"
     if is_new := not data.exists():
@@ -138,10 +138,12 @@ def _described(side: str, images: Path, folder: Path, flags: FromImages, *, prog
 
     own = [getattr(flags, field.name) for field in dataclasses.fields(Describing)]
     places = [images] if flags.model is None else [images, flags.model]
-    out = folder / f"{side}-{key_of((str(images), own), places)}.npy"
+    out = folder / f"{side}-{key_of(own, places)}.npy"
     if out.exists():
         say(f"{side} descriptors: {out} (kept, nothing changed)")
         return out
+    # A recipe without its rows is of a run that was stopped just before the end.
+    out.with_suffix(".toml").unlink(missing_ok=True)
     made = describe_folder(images, out, flags, progress=progress)
     say(f"{side} descriptors: {out} (made of {made.n_images:,} images, {made.kind}, in the order of"
         f" their {made.order})")  # fmt: skip
