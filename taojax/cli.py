@@ -35,6 +35,7 @@ from taojax.verbs import (
     score,
     simulate,
     sweep,
+    view,
     watch,
 )
 from taojax.verbs.common import say
@@ -55,6 +56,7 @@ Verb = (
     | closures.Closures
     | graph.Graph
     | explain.Explain
+    | view.View
     | watch.Watch
     | compare.Compare
     | rerun.Rerun
@@ -75,6 +77,7 @@ RUN = {
     closures.Closures: closures.run,
     graph.Graph: graph.run,
     explain.Explain: explain.run,
+    view.View: view.run,
     watch.Watch: watch.run,
     compare.Compare: compare.run,
     rerun.Rerun: rerun.run,

@@ -7,8 +7,11 @@ from taojax import records
 from taojax.audit import figures
 from taojax.audit.evaluate import evaluate
 from taojax.config import AuditConfig, Config, StreamConfig, to_toml
-from taojax.risk import Calibration, Risk, shipped
+from taojax.risk import Calibration, Risk, for_run, shipped
+from taojax.risk import to_toml as calibration_toml
 from taojax.specs import column_names
+from taojax.tables import table_text
+from taojax.verdicts import decide
 
 N_CANDIDATES = 100
 
@@ -66,8 +69,26 @@ def answered(answer, map_index, is_wrong, rng):
     )  # fmt: skip
 
 
-def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulated",)):
-    """Write a sealed run and its truth; return (run folder, truth folder)."""
+def decided(truth, signals, delayed):
+    """Return what a run holds that also decided, and its odometry."""
+    numbers = for_run(shipped(), 0.05, config().verdict.lag)
+    step = np.diff(truth, axis=0, prepend=truth[:1])
+    columns = {"t_s": signals["t_s"], "dx_m": step[:, 0], "dy_m": step[:, 1]}
+    odometry = table_text("query_odometry", columns | {"dtheta_rad": np.zeros(len(truth))})
+    return {
+        "odometry": odometry.encode(),
+        "decisions": decide(numbers, signals, delayed),
+        "calibration_toml": calibration_toml(numbers),
+    }
+
+
+def seal(  # noqa: PLR0913 - what a run may be
+    folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulated",), whole=False
+):
+    """Write a sealed run and its truth; return (run folder, truth folder).
+
+    A whole run holds its odometry and has decided.
+    """
     rng = np.random.default_rng(seed + 1)
     truth, map_m = world(n, always_in=always_in, seed=seed)
     gap = np.linalg.norm(truth[:, None] - map_m[None], axis=2)
@@ -99,7 +120,9 @@ def seal(folder, *, n=240, always_in=False, seed=7, status=None, notes=("simulat
         index=index,
         similarity=np.where(index >= 0, 0.5, 0.0),
         config_toml=to_toml(config()),
-        manifest={"command": "taojax score made-up", "dataset": "made-up", "notes": list(notes)},
+        manifest={"command": "taojax score made-up", "dataset": "made-up", "notes": list(notes)}
+        | ({"map_spacing_m": 2.0, "dataset": str(folder)} if whole else {}),
+        **(decided(truth, signals | now, delayed) if whole else {}),
     )
     (folder / "truth").mkdir()
     rows = [f"{0.5 * i},{x!r},{y!r},0.0" for i, (x, y) in enumerate(truth.tolist())]

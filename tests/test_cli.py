@@ -18,7 +18,7 @@ VERBS = (
     "audit", "score", "evaluate", "simulate", "kidnap", "sweep", "bench", "export", "convert",
     "describe", "inspect",
     "compare", "doctor", "rerun",
-    "closures", "explain", "graph", "watch",
+    "closures", "explain", "graph", "view", "watch",
 )  # fmt: skip
 
 

@@ -7,6 +7,8 @@ import pytest
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra images: pip install 'taojax[images]'")
 
+from street import model  # noqa: E402
+
 from taojax.cli import main  # noqa: E402
 from taojax.datasets import describe as described  # noqa: E402
 from taojax.datasets.images import Preparation, eight_bit, list_images, read_image  # noqa: E402
@@ -143,25 +145,6 @@ def test_rows_that_are_there_are_not_overwritten(tmp_path, capsys):
     assert run(folder, tmp_path / "map.npy") == 0
     assert run(folder, tmp_path / "map.npy") == 3
     assert "is there already" in capsys.readouterr().err
-
-
-def model(path, *, channels=3, side=28, batch="n"):
-    """Write a network that averages patches of its input."""
-    onnx = pytest.importorskip("onnx", reason="needs onnx: pip install onnx")
-    pytest.importorskip("onnxruntime", reason="needs the extra images")
-    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
-    nodes = [
-        helper.make_node("AveragePool", ["image"], ["pooled"], kernel_shape=[7, 7], strides=[7, 7]),
-        helper.make_node("Flatten", ["pooled"], ["rows"]),
-    ]
-    shape = [batch, channels, side, side]
-    graph = helper.make_graph(
-        nodes, "patches", [helper.make_tensor_value_info("image", kind, shape)],
-        [helper.make_tensor_value_info("rows", kind, [batch, channels * (side // 7) ** 2])],
-    )  # fmt: skip
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    onnx.save(made, path)
-    return path
 
 
 @pytest.mark.parametrize("batch", ["n", 1])

@@ -78,8 +78,8 @@ def test_frames_disagree_where_the_lists_point_elsewhere(folder):
     on, off = (explain(folder / "joint", run, frame) for frame in (25, 47))
     pairs = zip(on.window.frame, on.window.anchor, strict=True)
     assert all(anchor in run.index[frame] for frame, anchor in pairs)
-    assert on.window.is_inlier.mean() > 0.8 > 0.5 > off.window.is_inlier.mean()
-    assert (off.window.cost > on.window.cost.max()).mean() > 0.5
+    assert on.window.is_inlier.mean() > off.window.is_inlier.mean()
+    assert np.median(off.window.cost) > np.median(on.window.cost)
 
 
 def test_other_places_lie_apart_and_are_told_cheapest_first(folder):

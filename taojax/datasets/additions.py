@@ -27,7 +27,7 @@ from taojax.errors import InputError
 from taojax.specs import fail
 from taojax.tables import MOTION, POSE, read_table
 
-__all__ = ["Added", "add_query", "add_truth", "make_map"]
+__all__ = ["TRUTH", "Added", "add_query", "add_truth", "make_map", "truth_text"]
 
 MAP, QUERY, TRUTH = "map/poses.csv", "query/odometry.csv", "truth/query_poses.csv"
 
@@ -101,8 +101,7 @@ def add_truth(
 
     Args:
         out: the folder.
-        poses: any file that `read_poses` takes, in the frame of the map before its origin was
-            subtracted; stamped, or one row per frame.
+        poses: as `truth_text` has it, with all that follows.
         reading: what the user says of the file.
         gate_s: a frame farther than this from every true pose cannot be judged, seconds.
         offset_s: to add to the stamps of the true poses [s]; None: found where it can be found.
@@ -111,9 +110,33 @@ def add_truth(
         InputError: there is a truth, a frame has no pose, or the poses lie elsewhere.
     """
     _check_new(out, TRUTH)
-    t_s = read_table(out / QUERY, "query_odometry")["t_s"]
+    text, more = truth_text(out, poses, reading, gate_s=gate_s, offset_s=offset_s)
     about = read_about(out)
-    notes = about.notes
+    texts = {
+        TRUTH: text,
+        "about.toml": about_text(dict.fromkeys([*about.notes, *more]), about.own_gap_m),
+    }
+    return _write(out, texts, {}, more)
+
+
+def truth_text(
+    out: Path, poses: Path, reading: Reading = PLAIN, *, gate_s: float, offset_s: float | None
+) -> tuple[str, tuple[str, ...]]:
+    """Return truth/query_poses.csv for the query of a folder, and what was assumed of its poses.
+
+    Args:
+        out: the folder; nothing is written.
+        poses: any file that `read_poses` takes, in the frame of the map before its origin was
+            subtracted; stamped, or one row per frame.
+        reading: what the user says of the file.
+        gate_s: a frame farther than this from every true pose cannot be judged, seconds.
+        offset_s: to add to the stamps of the true poses [s]; None: found where it can be found.
+
+    Raises:
+        InputError: a frame has no pose, or the poses lie elsewhere.
+    """
+    t_s = read_table(out / QUERY, "query_odometry")["t_s"]
+    notes = read_about(out).notes
     frames = tuple(f"{row:06d}" for row in range(len(t_s)))
     own = (NUMBERED,) if np.array_equal(t_s, np.arange(len(t_s))) else ()
     session = Session(frames, Trajectory(t_s, np.zeros((len(t_s), 3))), False, own)
@@ -134,11 +157,7 @@ def add_truth(
         raise fail(poses, what, "give true poses in the frame of the map")
     told = tuple(note for note in drive.notes if note != NUMBERED)
     more = tuple(f"truth: {note}" for note in (*told, *said))
-    texts = {
-        TRUTH: stamped_text("query_poses", POSE, t_s, xyt),
-        "about.toml": about_text(dict.fromkeys([*notes, *more]), about.own_gap_m),
-    }
-    return _write(out, texts, {}, more)
+    return stamped_text("query_poses", POSE, t_s, xyt), more
 
 
 def _check_new(out: Path, name: str) -> None:

@@ -27,7 +27,7 @@ from taojax.datasets.images import (
     names_below,
     read_image,
 )  # fmt: skip
-from taojax.errors import MissingExtraError
+from taojax.errors import InputError, MissingExtraError
 from taojax.records import digest_file
 from taojax.specs import fail, first_line, write_atomically
 
@@ -243,11 +243,16 @@ def describe(
     key = _key(head, paths)
     held = _Held(out, key)
     starts = range(held.done, len(paths), batch)
-    for start in tell(starts):
-        own = paths[start : start + batch]
-        rows = rows_of([_prepared(path, kind, how) for path in own])
-        _check_rows(own, rows)
-        held.add(start, rows, len(paths))
+    try:
+        for start in tell(starts):
+            own = paths[start : start + batch]
+            rows = rows_of([_prepared(path, kind, how) for path in own])
+            _check_rows(own, rows)
+            held.add(start, rows, len(paths))
+    except InputError:
+        # Once the image is mended or removed they are other images, and the run starts anew.
+        held.drop()
+        raise
     names = names_below(folder, paths)
     lines = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in head.items()]
     lines.append(f"names = {json.dumps(names, ensure_ascii=False, indent=0)}")
@@ -315,6 +320,10 @@ class _Held:
             raise fail(self._out, what, "choose another --out") from error
         done = {"key": self._key, "done": start + len(rows)}
         write_atomically(self._state, json.dumps(done))
+
+    def drop(self) -> None:
+        """Leave nothing behind."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def finish(self) -> int:
         """Put the rows in their place and return their length."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.errors import UsageError
+from taojax.errors import InputError, UsageError
 from taojax.verbs.common import (
     SCENARIOS,
     Common,
@@ -21,8 +21,10 @@ from taojax.verbs.common import (
     score_apart,
     told,
 )
+from taojax.verbs.from_images import FOLDER, FromImages, are_asked, make
 from taojax.verbs.layout import check_drive, check_layout
 from taojax.verbs.resume import claimed, is_sealed
+from taojax.verbs.score import decided
 
 if TYPE_CHECKING:
     from taojax.config import Config
@@ -32,7 +34,8 @@ if TYPE_CHECKING:
 class Audit(Common):
     """The main job: score, seal, label, calibrate, measure, report.
 
-    Without DATASET it runs on the built-in simulated KAIST-like world, in its four scenarios.
+    Without DATASET it runs on the built-in simulated KAIST-like world, in its four scenarios; with
+    --map-images it begins with two folders of images.
 
     Example: taojax audit my_data --r-in 5 --r-out 10
     """
@@ -58,9 +61,44 @@ class Audit(Common):
     gap_m: Annotated[float | None, flag("M", "50")] = None
     """With --self: way between a frame and the newest one that it may close on, metres."""
 
+    images: Annotated[FromImages, tyro.conf.OmitArgPrefixes] = dataclasses.field(
+        default_factory=FromImages
+    )
+
 
 def run(args: Audit) -> None:
-    """Audit a data folder or the simulated world."""
+    """Audit a data folder, two folders of images or the simulated world."""
+    _check(args)
+    has_images = are_asked(args.images)
+    is_ready = args.dataset is not None and not args.simulate_views and not args.self
+    if args.dataset is not None and is_ready:
+        check_layout(args.dataset, has_truth=True)
+    if args.dataset is not None and args.self:
+        check_drive(args.dataset)
+    config = config_of(args)
+    out = out_of(args, "audit", config)
+    if has_images:
+        _audit_images(args, out, config)
+        return
+    if args.dataset is not None and is_ready:
+        _audit_folder(args.dataset, out, config, progress=args.progress)
+        return
+    with claimed(out, told(args, config)):
+        if args.dataset is not None:
+            _audit_converted(args, out, config)
+        else:
+            _audit_world(args.scenario, out, config, progress=args.progress)
+
+
+def _check(args: Audit) -> None:
+    """Refuse flags that contradict each other."""
+    if are_asked(args.images) and (
+        args.dataset is not None or args.scenario or args.simulate_views or args.self
+    ):
+        raise UsageError(
+            "--map-images stands in the place of DATASET, --scenario, --simulate-views and --self;"
+            " drop one of them"
+        )
     if args.dataset is not None and args.scenario is not None:
         raise UsageError("--scenario names a part of the simulated world; drop it or DATASET")
     if args.simulate_views and args.dataset is None:
@@ -71,21 +109,6 @@ def run(args: Audit) -> None:
         raise UsageError("--self audits one DATASET as it is; name it and drop --simulate-views")
     if args.gap_m is not None and not args.self:
         raise UsageError("--gap-m goes with --self")
-    is_ready = args.dataset is not None and not args.simulate_views and not args.self
-    if args.dataset is not None and is_ready:
-        check_layout(args.dataset, has_truth=True)
-    if args.dataset is not None and args.self:
-        check_drive(args.dataset)
-    config = config_of(args)
-    out = out_of(args, "audit", config)
-    if args.dataset is not None and is_ready:
-        _audit_folder(args.dataset, out, config, progress=args.progress)
-        return
-    with claimed(out, told(args, config)):
-        if args.dataset is not None:
-            _audit_converted(args, out, config)
-        else:
-            _audit_world(args.scenario, out, config, progress=args.progress)
 
 
 def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool) -> None:
@@ -98,16 +121,38 @@ def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool)
     _judge(dataset, out, config)
 
 
+def _audit_images(args: Audit, out: Path, config: "Config") -> None:
+    """Describe and convert beside the run, score, and judge where the truth is known."""
+    from taojax.datasets.additions import TRUTH
+    from taojax.records import refuse_if_taken
+    from taojax.specs import write_atomically
+
+    if not (out / "manifest.json").is_file():
+        refuse_if_taken(out)
+    data, truth_csv = make(args.images, out.parent / FOLDER, progress=args.progress)
+    if (out / "manifest.json").is_file() and not is_sealed(out, data, config):
+        raise InputError(f"{out}: holds a run of other images, files or flags; choose a new --out")
+    score_apart([Scoring(data, out)], config, progress=args.progress)
+    if truth_csv is None:
+        say("nothing is judged: no --truth; the calibration that ships with taojax decided")
+        say(decided(out))
+        return
+    write_atomically(data / TRUTH, truth_csv)
+    _judge(data, out, config)
+
+
 def _convert(args: Audit, data: Path, seed: int) -> None:
     """Make the data folder that is audited in place of DATASET."""
-    from taojax.verbs.convert import make, make_self
+    from taojax.verbs import convert
     from taojax.verbs.convert_flags import Folder, Self
 
     assert args.dataset is not None  # noqa: S101 - the caller has asked
     if args.self:
-        make_self(Self(folder=args.dataset, out=data, gap_m=args.gap_m, seed=seed))
+        convert.make_self(Self(folder=args.dataset, out=data, gap_m=args.gap_m, seed=seed))
         return
-    make(Folder(folder=args.dataset, out=data, map=args.map, simulate_views=True, seed=seed))
+    convert.make(
+        Folder(folder=args.dataset, out=data, map=args.map, simulate_views=True, seed=seed)
+    )
 
 
 def _audit_converted(args: Audit, out: Path, config: "Config") -> None:

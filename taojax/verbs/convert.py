@@ -14,6 +14,7 @@ from taojax.verbs.convert_flags import (
     Convert,
     Files,
     Folder,
+    Formats,
     Kri,
     Mulran,
     Pair,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
     Sessions = tuple[Session, Session | None]
 
-__all__ = ["Convert", "make", "make_self", "run"]
+__all__ = ["Convert", "make", "make_self", "motion_of", "reading_of", "run"]
 
 Data = Pair | Folder | Files
 
@@ -91,7 +92,7 @@ def _add(data: Files) -> None:
     from taojax.datasets import additions
     from taojax.datasets.plain import read_session
 
-    reading = _reading(data, is_motion=False)
+    reading = reading_of(data, is_motion=False)
     out, truth = data.out, data.query_poses
     if data.map_poses is not None and data.map_views is not None:
         mapped = read_session(data.map_poses, data.map_poses.parent, reading)
@@ -171,40 +172,52 @@ def _check_parts(data: Files) -> None:
         raise UsageError("what is known of the query? Give --odometry, --query-poses or both")
 
 
-def _reading(data: Data, *, is_motion: bool) -> "Reading":
+def reading_of(flags: Formats, *, is_motion: bool) -> "Reading":
     """Return what the user says of files of poses or, with its own flags, of the odometry."""
     from taojax.datasets.reading import Reading
 
-    columns = tuple(name.strip() for name in (data.columns or "").split(",") if name.strip())
+    columns = tuple(name.strip() for name in (flags.columns or "").split(",") if name.strip())
     return Reading(
-        times=data.times if is_motion else None,
-        topic=data.topic if is_motion else None,
-        plane=data.plane,
-        time_unit=data.time_unit,
-        quaternion=data.quaternion,
-        angles=data.angles,
+        times=flags.times if is_motion else None,
+        topic=flags.topic if is_motion else None,
+        plane=flags.plane,
+        time_unit=flags.time_unit,
+        quaternion=flags.quaternion,
+        angles=flags.angles,
         columns=columns,
-        decimal=data.decimal,
+        decimal=flags.decimal,
         is_shared=not is_motion,
     )
 
 
 def _motion(data: Data) -> "Motion | None":
     """Return the odometry that was asked for, else the data set's own, if any."""
-    from taojax.datasets.convert import Motion, recorded_odometry
+    from taojax.datasets.convert import recorded_odometry
 
-    if data.odometry is None:
-        own = {Folder: "folder", Files: None}.get(type(data), "query")
-        return None if own is None else recorded_odometry(getattr(data, own))
-    reading = _reading(data, is_motion=True)
-    if (kind := data.odometry_kind or _kind_of(data.odometry, reading)) is None:
-        refusal = UsageError if data.odometry.suffix.lower() == ".npy" else InputError
+    if data.odometry is not None:
+        return motion_of(data.odometry, data)
+    own = {Folder: "folder", Files: None}.get(type(data), "query")
+    return None if own is None else recorded_odometry(getattr(data, own))
+
+
+def motion_of(path: Path, flags: Formats) -> "Motion":
+    """Return the odometry of a file, of the kind that the flags or the file say.
+
+    Raises:
+        InputError: text that does not say what it holds.
+        UsageError: an array, of which only the user can say it.
+    """
+    from taojax.datasets.convert import Motion
+
+    reading = reading_of(flags, is_motion=True)
+    if (kind := flags.odometry_kind or _kind_of(path, reading)) is None:
+        refusal = UsageError if path.suffix.lower() == ".npy" else InputError
         raise refusal(
-            f"{data.odometry} does not say what it holds; add --odometry-kind: steps (motion from"
+            f"{path} does not say what it holds; add --odometry-kind: steps (motion from"
             " frame to frame), poses (where odometry believes to be), or the program that wrote it;"
             " or --columns with the names of its columns"
         )
-    return Motion(data.odometry, kind, reading, data.clock_offset)
+    return Motion(path, kind, reading, flags.clock_offset)
 
 
 def _kind_of(path: Path, reading: "Reading") -> "MotionKind | None":
@@ -337,7 +350,7 @@ def _files(data: Files, matching: "Matching") -> "Sessions":
 
     if data.map_poses is None:
         raise UsageError("give --map-poses")
-    return read_files(data.map_poses, data.query_poses, _reading(data, is_motion=False))
+    return read_files(data.map_poses, data.query_poses, reading_of(data, is_motion=False))
 
 
 _READ: dict[type, Callable[[Any, "Matching"], "Sessions"]] = {

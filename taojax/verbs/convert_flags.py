@@ -23,29 +23,11 @@ def _place(metavar: str) -> Any:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Making:
-    """Flags of every data set."""
-
-    map_frames: Annotated[int | None, flag("N", "2000; of folder and files, all")] = None
-    """Map frames to keep, evenly by number."""
-
-    query_frames: Annotated[int | None, flag("N", "1000; of folder and files, all")] = None
-    """Query frames to keep, evenly by number."""
-
-    spacing_m: Annotated[float | None, flag("M", "by number")] = None
-    """Keep a frame every so many metres of way instead; standing frames then count once."""
+class Formats:
+    """How files of poses and odometry are read."""
 
     gate_s: float = 0.5
     """A pose or odometry farther than this from a frame in time is none, seconds."""
-
-    pose: Literal["interpolated", "nearest"] = "interpolated"
-    """Whether a frame lies between the poses around it or at the nearest."""
-
-    least_matched: float = 0.5
-    """Refuse a session where a smaller share of the frames has a pose."""
-
-    odometry: Annotated[Path | None, flag("FILE", "the set's own, else simulated")] = None
-    """Odometry of the query session."""
 
     odometry_kind: Annotated[Kind | None, flag("KIND", "as its header or columns say")] = None
     """Its format: tum, kitti, euroc, g2o, csv (stamped poses), steps (as query/odometry.csv),
@@ -75,9 +57,6 @@ class Making:
     decimal: Annotated[Literal["point", "comma"] | None, flag("point|comma", "recognised")] = None
     """Decimal sign of text."""
 
-    views_order: Annotated[Literal["rows", "time"] | None, flag("rows|time", "asked")] = None
-    """What descriptors follow where rows of poses came late: the rows of that file, or time."""
-
     plane: Annotated[Literal["xz", "xy", "xz-up"] | None, flag("PLANE", "as the kind has it")] = (
         None
     )
@@ -85,6 +64,32 @@ class Making:
 
     topic: Annotated[str | None, flag("NAME", "the only one")] = None
     """Odometry topic of a bag."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Making(Formats):
+    """Flags of every data set."""
+
+    map_frames: Annotated[int | None, flag("N", "2000; of folder and files, all")] = None
+    """Map frames to keep, evenly by number."""
+
+    query_frames: Annotated[int | None, flag("N", "1000; of folder and files, all")] = None
+    """Query frames to keep, evenly by number."""
+
+    spacing_m: Annotated[float | None, flag("M", "by number")] = None
+    """Keep a frame every so many metres of way instead; standing frames then count once."""
+
+    pose: Literal["interpolated", "nearest"] = "interpolated"
+    """Whether a frame lies between the poses around it or at the nearest."""
+
+    least_matched: float = 0.5
+    """Refuse a session where a smaller share of the frames has a pose."""
+
+    odometry: Annotated[Path | None, flag("FILE", "the set's own, else simulated")] = None
+    """Odometry of the query session."""
+
+    views_order: Annotated[Literal["rows", "time"] | None, flag("rows|time", "asked")] = None
+    """What descriptors follow where rows of poses came late: the rows of that file, or time."""
 
     map_views: Annotated[Path | None, flag("FILE", "none")] = None
     """Descriptors of the map images (npy, npz, h5); or, without --query-views, one file that

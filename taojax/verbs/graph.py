@@ -50,7 +50,7 @@ def run(args: Graph) -> None:
     from taojax.records import read_run
 
     sealed = read_run(args.run)
-    facts = _evaluated(args.run)
+    facts = evaluated(args.run)
     truth = args.truth or _truth_of(args.run, str(sealed.manifest.get("dataset", "")))
     _refuse_foreign(truth, facts)
     config = from_toml(args.run / "config.toml")
@@ -66,7 +66,7 @@ def run(args: Graph) -> None:
     say(f"written to {out}/graph.html, tables/graph.csv and figures/graph.png")
 
 
-def _evaluated(run: Path) -> dict[str, Any]:
+def evaluated(run: Path) -> dict[str, Any]:
     """Return what the judge of this run was told; empty where there was none."""
     from taojax.specs import read_text
 

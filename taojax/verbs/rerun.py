@@ -11,6 +11,7 @@ import tyro
 
 from taojax.errors import GateError, InputError
 from taojax.verbs.common import flag, say
+from taojax.verbs.from_images import FOLDER
 
 if TYPE_CHECKING:
     import numpy as np
@@ -106,6 +107,7 @@ def data_places(run: Path, named: str) -> Iterator[Path]:
     yield run.resolve().parent / named
     yield run / "data"
     yield run.resolve().parent / "data" / run.resolve().name
+    yield run.resolve().parent / FOLDER / Path(named).name
 
 
 def _find(run: Path, named: str) -> Path:

@@ -61,10 +61,10 @@ def run(args: Score) -> None:
         say(f"note: {note}")
     say(f"sealed {out}/signals.csv (seal {manifest['seal'][:12]})")
     if args.advice:
-        say(_next(out))
+        say(decided(out))
 
 
-def _next(out: Path) -> str:
+def decided(out: Path) -> str:
     """Say what was decided and what can be done with it."""
     from taojax.tables import read_table
 

@@ -1,0 +1,144 @@
+"""Two folders of images as two sessions: which image has which pose, or which motion.
+
+Images named by UNIX time are matched by it; others are as many as rows and follow their order.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from taojax.datasets.clocks import PER_S
+from taojax.datasets.convert import Motion
+from taojax.datasets.files import read_motion, read_poses
+from taojax.datasets.folder import Session
+from taojax.datasets.images import list_images, names_below
+from taojax.datasets.plain import session_of
+from taojax.datasets.reading import Drive, Reading
+from taojax.datasets.sessions import Matching, matched_session
+from taojax.datasets.trajectory import Trajectory, pose_at
+from taojax.records import code_digest
+from taojax.specs import fail
+
+__all__ = ["Images", "images_of", "key_of", "map_session", "query_session"]
+
+UNIT_OF = {10: "s", 13: "ms", 16: "us", 19: "ns"}
+"""Unit of a UNIX time of so many digits, from 2001 to 2286."""
+
+TIMED = "images were taken when their names say, in UNIX time"
+
+FIX = "store one row per image in the order of their names, or name images by their UNIX time"
+
+
+class Images(NamedTuple):
+    """The images of one drive, in the order in which they were taken."""
+
+    folder: Path
+    paths: tuple[Path, ...]
+    names: tuple[str, ...]
+    """Relative to the folder."""
+
+    t_s: Float[np.ndarray, " n"] | None
+    """When each was taken, where all names are UNIX times [s]."""
+
+
+def images_of(folder: Path) -> Images:
+    """List the images of a folder and read the times off their names.
+
+    Raises:
+        InputError: no folder, fewer than three images, or names that are times which do not rise.
+    """
+    paths, _ = list_images(folder)
+    found = [_unix_s(path.stem) for path in paths]
+    times = [t for t in found if t is not None]
+    t_s = np.array(times) if len(times) == len(paths) else None
+    if t_s is not None and (late := np.flatnonzero(np.diff(t_s) <= 0)).size:
+        at = int(late[0])
+        what = f"its name is a time not after that of {paths[at].name}"
+        raise fail(paths[at + 1], what, "name the folder of one camera and one drive")
+    return Images(folder, tuple(paths), tuple(names_below(folder, paths)), t_s)
+
+
+def _unix_s(stem: str) -> float | None:
+    """Return the UNIX time that a name is, such as 1600000000.25 or 1600000000250000000."""
+    whole, dot, part = stem.partition(".")
+    unit = UNIT_OF.get(len(whole))
+    if not (whole.isascii() and whole.isdigit()) or unit is None:
+        return None
+    if dot and not (unit == "s" and part.isascii() and part.isdigit()):
+        return None
+    return float(stem) if dot else int(whole) / PER_S[unit]
+
+
+def map_session(images: Images, poses: Path, reading: Reading, matching: Matching) -> Session:
+    """Give the images of the map their poses.
+
+    Args:
+        images: of the map drive.
+        poses: any file that `read_poses` takes.
+        reading: what the user says of it.
+        matching: how near in time a pose must be.
+
+    Raises:
+        InputError: the file is malformed, or neither times nor numbers of rows fit the images.
+    """
+    drive = read_poses(poses, reading)
+    if images.t_s is not None and drive.has_stamps:
+        covered = pose_at(drive.poses, images.t_s, matching.gate_s)[1].mean()
+        if covered >= matching.least or not _is_row_by_row(drive, images):
+            frames, notes = (images.names, images.t_s), (*drive.notes, TIMED)
+            return matched_session(images.folder, frames, drive.poses, matching, notes)
+    _check_row_by_row(drive, images, poses)
+    return session_of(drive, images.names)
+
+
+def query_session(images: Images, motion: Motion) -> Session | None:
+    """Give the images of the query their times; where they are is for nobody to know here.
+
+    Args:
+        images: of the query drive.
+        motion: its odometry.
+
+    Returns:
+        None where the rows of the odometry are the frames.
+
+    Raises:
+        InputError: the odometry is malformed, or has neither times nor as many rows as images.
+    """
+    drive = read_motion(motion.path, motion.kind, motion.reading)
+    if images.t_s is None or not drive.has_stamps:
+        _check_row_by_row(drive, images, motion.path)
+    if images.t_s is None:
+        return None
+    unknown = Trajectory(images.t_s, np.zeros((len(images.t_s), 3)))
+    return Session(images.names, unknown, False, (TIMED,))
+
+
+def _is_row_by_row(drive: Drive, images: Images) -> bool:
+    return (drive.n_rows or len(drive.poses.t_s)) == len(images.paths)
+
+
+def _check_row_by_row(drive: Drive, images: Images, path: Path) -> None:
+    if not _is_row_by_row(drive, images):
+        n_rows = drive.n_rows or len(drive.poses.t_s)
+        what = f"{n_rows:,} rows, but {images.folder} holds {len(images.paths):,} images"
+        raise fail(path, what, FIX)
+
+
+def key_of(said: object, places: Iterable[Path]) -> str:
+    """Return what tells one intermediate file from another: 12 hex digits.
+
+    Args:
+        said: all else that decides what is made; its `repr` counts.
+        places: files, and folders with all that lies in them; names, sizes and times of writing
+            count, and so does the code of this package.
+    """
+    files = [
+        file for place in places
+        for file in (sorted(place.rglob("*")) if place.is_dir() else [place]) if file.is_file()
+    ]  # fmt: skip
+    states = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    return hashlib.sha256(repr((said, states, code_digest())).encode()).hexdigest()[:12]
