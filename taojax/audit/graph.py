@@ -408,7 +408,7 @@ class Brief(NamedTuple):
 
     picture: Picture | None = None
     is_lead: bool = False
-    """Whether it was measured, and belongs on the first screen."""
+    """Whether it was measured, and is told right after the first sentence."""
 
     is_alarm: bool = False
 
