@@ -463,7 +463,6 @@ def _page(judged: Judged, drawn: Picture, facts: dict[str, str], command: str) -
             notes=[],
             headline=found[1:],
             lead=found[:1],
-            cards=[],
             grids=[grid("graph", judged.table, title="Back-ends and closures", note=note)],
             pictures=[drawn],
             facts=facts,

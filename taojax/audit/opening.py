@@ -24,6 +24,9 @@ class Number(NamedTuple):
     word: str
     """Its entry in the glossary."""
 
+    is_broken: bool = False
+    """Whether it is above what was promised."""
+
 
 def accepted_row(judgement: Judgement, verdict: str) -> dict[str, Any]:
     """Return one row of tables/verdicts.csv: now or final."""
@@ -62,6 +65,15 @@ def is_refused(judgement: Judgement) -> bool:
     return bool(np.isnan(judgement.calibration.final.level))
 
 
+def is_broken(row: Mapping[str, Any]) -> bool:
+    """Say whether more of the accepted answers are wrong than was promised.
+
+    Args:
+        row: of tables/verdicts.csv.
+    """
+    return bool(row["wrong_share"] > row["max_wrong"])
+
+
 def sentence(judgement: Judgement) -> str:
     """Say of the accepted how many are right, of the right how many are accepted, what is promised.
 
@@ -75,9 +87,15 @@ def sentence(judgement: Judgement) -> str:
     n, right, total = (int(row[name]) for name in ("accepted", "right", "right_total"))
     most = percent(float(row["max_wrong"]))
     if n:
+        promise = (
+            f"at most {most} wrong were promised, {_promised(judgement)}, and "
+            f"{percent(float(row['wrong_share']))} are"
+            if is_broken(row)
+            else f"at most {most} wrong are promised, {_promised(judgement)}"
+        )
         return (
             f"{right} of {n} accepted answers are right, and {right} of {total} right answers are "
-            f"accepted; at most {most} wrong are promised, {_promised(judgement)}."
+            f"accepted; {promise}."
         )
     found = f"though {total} answers are right" if total else "and no answer is right"
     why = (
@@ -111,13 +129,15 @@ def numbers(judgement: Judgement) -> tuple[Number, Number, Number]:
     else:
         two = "no test answer is right" if frames else "there is no test half"
     if is_refused(judgement):
-        three, said = "nothing", str(row["promise"])
+        # What was found and what would help; that nothing is accepted the sentence has said.
+        three, said = "nothing", str(row["promise"]).partition(": ")[2]
     else:
         three = f"at most {percent(float(row['max_wrong']))}"
         said = f"of the accepted answers wrong, {_promised(judgement)}"
+    share, recall = (percent(float(row[name])) for name in ("wrong_share", "recall"))
     return (
-        Number("wrong among the accepted", percent(float(row["wrong_share"])), one, "wrong share"),
-        Number("of the right ones accepted", percent(float(row["recall"])), two, "recall"),
+        Number("wrong among the accepted", share, one, "wrong share", is_broken(row)),
+        Number("of the right ones accepted", recall, two, "recall"),
         Number("promised", three, said, "accepted"),
     )
 
@@ -139,13 +159,14 @@ def summary_sentence(judgements: Mapping[str, Judgement]) -> str:
     """
     rows = {name: accepted_row(judged, "final") for name, judged in judgements.items()}
     n, right, total = (
-        sum(int(row[name]) for row in rows.values()) for name in ("accepted", "right", "right_total")
+        sum(int(row[name]) for row in rows.values())
+        for name in ("accepted", "right", "right_total")
     )
     many = f"{len(rows)} scenario" + ("s" if len(rows) != 1 else "")
     if not n:
         return f"No closure is accepted in {many}, though {total} answers are right."
     most = percent(max(float(row["max_wrong"]) for row in rows.values()))
-    broken = [name for name, row in rows.items() if row["wrong_share"] > row["max_wrong"]]
+    broken = [name for name, row in rows.items() if is_broken(row)]
     empty = [name for name, row in rows.items() if not row["accepted"]]
     kept = (
         f"more than the promised {most} are wrong in {', '.join(broken)}"

@@ -11,7 +11,7 @@ from taojax.plots import map_limits
 KINDS = {
     "abstained": "abstained",
     "rejected": "rejected",
-    "aside": "accepted off the map, where it says: no closure, counts neither way",
+    "aside": "accepted off the map, pose right: counts neither way",
     "right": "accepted, right",
     "wrong": "accepted, wrong",
 }
@@ -33,12 +33,12 @@ class Entry(NamedTuple):
 
     kind: str
     label: str
-    count: int
+    frames: int
     n_right: int
     """Right answers among those that are not accepted."""
 
-    frame: int
-    """The first of them; -1 = there is none."""
+    first: int
+    """Number of the first of them; -1 = there is none."""
 
 
 class Drawing(NamedTuple):
@@ -130,7 +130,7 @@ def draw_opening(judgement: Judgement) -> Drawing:
     place = lambda xy: np.stack([xy[:, 0] - left, high[1] - xy[:, 1]], axis=1) * scale
     tall = high_m * scale
     legend = _legend(judgement, kind, is_test)
-    told = ", ".join(f"{entry.label} {entry.count}" for entry in legend)
+    told = ", ".join(f"{entry.label} {entry.frames}" for entry in legend)
     before = judgement.query_m[~is_test]
     parts = [
         f'<svg viewBox="0 0 {_WIDE:.0f} {tall:.0f}" role="img" '

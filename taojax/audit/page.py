@@ -64,13 +64,15 @@ class Page(NamedTuple):
     headline: Sequence[str]
     """What was found, in sentences."""
 
-    cards: Sequence[Cell]
     grids: Sequence[Grid]
     pictures: Sequence[Picture]
     facts: Mapping[str, str]
     command: str
     lead: Sequence[str] = ()
     """Sentences above everything else."""
+
+    cards: Sequence[Cell] = ()
+    """Numbers below them, where the page opens with no picture."""
 
     openings: Sequence[Opening] = ()
     """Picture and numbers below them; all that follows is folded where there is one."""

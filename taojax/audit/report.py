@@ -143,7 +143,6 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
             lead=lead,
             openings=[_opening(done)],
             headline=[said for said in done.sentences if said not in (*lead, *warned)],
-            cards=[],
             grids=[*_first_grids(judgement), *_run_grids(judgement)],
             # The page opens with the map; in the folder it stands beside the other figures.
             pictures=[drawn for drawn in pictures if drawn.name != "map"],
@@ -220,7 +219,7 @@ def write_summary(
         out: the folder that holds one run per scenario.
         scenarios: name -> judged run; `full` is the map that was not cut.
         command: what the user ran.
-        notes: printed on top, before those of the runs.
+        notes: printed on top; those of the runs are folded.
 
     Returns:
         What was found, in plain sentences.
@@ -238,22 +237,21 @@ def write_summary(
     if cut := summary.cut_maps(scenarios):
         pictures = (summary.compare(scenarios), scenario_figures.traces(cut), *pictures)
     said = {note for done in scenarios.values() for note in _notes(done.judgement)}
-    notes = [*notes, *sorted(said - set(notes))]
+    others, warned = sorted(said - set(notes)), all_alarms(scenarios)
     seals = {name: str(done.judgement.manifest["seal"]) for name, done in scenarios.items()}
-    manifest = {"schema": 1, "command": command, "notes": notes, "scenarios": seals}
+    manifest = {"schema": 1, "command": command, "notes": [*notes, *others], "scenarios": seals}
     page = Page(
         title="May these answers enter the graph? Summary over scenarios",
-        subtitle=f"{len(scenarios)} scenarios; each was scored, sealed and then judged.",
-        notes=notes,
+        subtitle=" ".join([*notes, f"{len(scenarios)} scenarios, each sealed, then judged."]),
+        notes=others,
         lead=(summary_sentence({name: done.judgement for name, done in scenarios.items()}),),
         openings=[_opening(done, name) for name, done in scenarios.items()],
-        headline=words,
+        headline=[told for told in words if told not in warned],
         words=glossary(),
         terms={
             "Signals": names_of_signals(),
             "Columns of the tables": names_of_tables(("mapout", "frozen", "recall", "micro")),
         },
-        cards=[],
         grids=[
             grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: AUROC",
                  note=_NOT_OURS, columns=_mapout_columns("auroc")),
@@ -268,7 +266,7 @@ def write_summary(
         pictures=pictures,
         facts={f"seal of {name}": seal for name, seal in seals.items()} | {"command": command},
         command=command,
-        warnings=all_alarms(scenarios),
+        warnings=warned,
     )  # fmt: skip
     files: dict[str, str | bytes] = {
         "metrics.csv": summary.joined_metrics(scenarios),
