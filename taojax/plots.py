@@ -117,8 +117,15 @@ def signal_trace(
     return ax
 
 
-def _map_limits(*groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners around all finite points; neither side is less than a share of the other."""
+def map_limits(*groups: Float[np.ndarray, "_ 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners around all finite points; neither side is less than a share of the other.
+
+    Args:
+        groups: positions to be drawn, metres.
+
+    Returns:
+        Lower left and upper right corner, `(2,)` each, metres.
+    """
     points = np.concatenate(groups)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -139,7 +146,7 @@ def map_size(
         wide_in: its width.
         most_in: height of the axes at most; tall maps are narrower.
     """
-    low, high = _map_limits(*groups)
+    low, high = map_limits(*groups)
     across, up = high - low
     inside = min(most_in, (wide_in - 1.0) * float(up / across))
     return wide_in, inside + BELOW_MAP_IN
@@ -175,7 +182,7 @@ def verdict_map(
                 *here.T, s=mark.size, color=mark.colour, marker=mark.marker, linewidths=0.7,
                 label=f"{mark.label} ({len(here)})", zorder=3 + order,
             )  # fmt: skip
-    low, high = _map_limits(map_m, query_m, matched_m[wrong])
+    low, high = map_limits(map_m, query_m, matched_m[wrong])
     ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal", adjustable="box", anchor="N")
     # In points below the axes: a share of their height would write over the label of a flat map.
@@ -306,7 +313,7 @@ def graph_map(
         ax.plot([], [], color=MAP_OUT, linewidth=1.0, label=label)
     ax.plot(*truth_m.T, color=INK, linewidth=0.9, linestyle=":", label="truth", zorder=3)
     ax.plot(*path_m.T, color=IN_MAP, linewidth=1.1, label="optimised", zorder=4)
-    low, high = _map_limits(map_m, truth_m)
+    low, high = map_limits(map_m, truth_m)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal", adjustable="box")
     ax.tick_params(labelsize=6)

@@ -100,11 +100,11 @@ def test_the_first_sentence_tells_the_accepted_and_the_right_apart(case):
     own = judgement.answers.at(judgement.splits.test.frame).final
     accepted = (judgement.verdicts["verdict"] == "accept")[judgement.splits.test.frame]
     right, wrong = (int((accepted & kind).sum()) for kind in own)
-    first = find_words(judgement)[0]
+    first, promised = find_words(judgement)[:2]
     assert right > 0
-    assert f"Of {right + wrong} accepted test answers {right} are right" in first
-    assert f"Of {int(own.is_right.sum())} right test answers {right} are accepted" in first
-    assert first.endswith(f"Promised: {judgement.calibration.final.promise}.")
+    assert first.startswith(f"{right} of {right + wrong} accepted answers are right, and ")
+    assert f"and {right} of {int(own.is_right.sum())} right answers are accepted" in first
+    assert promised == f"Promised: {judgement.calibration.final.promise}."
 
 
 def test_without_a_threshold_no_rate_pretends(case):

@@ -58,6 +58,34 @@ def test_a_fragment_chooses_the_frame_and_the_console_stays_silent(case):
     assert not re.search(r'<section id="route"[^>]*hidden', document)
 
 
+FOLDS = """
+const open = () => [...document.querySelectorAll("details.fold[open]")].map((fold) => fold.id);
+const seen = { start: open() };
+location.hash = "#frame=99";
+setTimeout(() => {
+  seen.frame = open();
+  dispatchEvent(new Event("beforeprint")); seen.print = open().length;
+  dispatchEvent(new Event("afterprint")); seen.after = open();
+  const told = document.createElement("pre");
+  told.id = "seen"; told.textContent = JSON.stringify(seen);
+  document.body.append(told);
+}, 400);
+"""
+
+
+@needs_browser
+def test_all_is_folded_until_asked_for_and_open_on_paper(case, tmp_path):
+    shutil.copy(case[0] / "report.html", tmp_path / "report.html")
+    document, console = opened(tmp_path / "report.html", "", FOLDS)
+    assert console == []
+    seen = json.loads(re.search(r'<pre id="seen">(.*?)</pre>', document)[1])
+    assert seen == {"start": [], "frame": ["along"], "print": 7, "after": ["along"]}
+    assert frame_of(document) == 99
+    document, console = opened(case[0] / "report.html", "#figures")
+    assert console == []
+    assert '<details class="fold" id="figures" open="">' in document
+
+
 CLICKS = """
 const seen = {}, frame = () => Number(document.getElementById("route").dataset.frame);
 const at = (id) => document.getElementById(id);

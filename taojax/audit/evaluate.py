@@ -109,7 +109,7 @@ def evaluate(run: Path, truth: Path, config: Config, *, out: Path | None = None)
         judgement=judgement,
         sentences=(*found[:at], *said, *found[at:]),
         command=_command(run, truth, config),
-        lead=said if graph.is_lead else (),
+        graph=said if graph.is_lead else (),
         warnings=said if graph.is_alarm else (),
     )
     files |= paste_files(judgement, done.command)

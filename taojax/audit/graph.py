@@ -408,7 +408,7 @@ class Brief(NamedTuple):
 
     picture: Picture | None = None
     is_lead: bool = False
-    """Whether it was measured, and belongs on the first screen."""
+    """Whether it was measured, and is told right after the first sentence."""
 
     is_alarm: bool = False
 
@@ -463,7 +463,6 @@ def _page(judged: Judged, drawn: Picture, facts: dict[str, str], command: str) -
             notes=[],
             headline=found[1:],
             lead=found[:1],
-            cards=[],
             grids=[grid("graph", judged.table, title="Back-ends and closures", note=note)],
             pictures=[drawn],
             facts=facts,

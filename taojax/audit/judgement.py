@@ -202,8 +202,8 @@ class Evaluation(NamedTuple):
     command: str
     """How to repeat the judging."""
 
-    lead: tuple[str, ...] = ()
-    """Sentences on the graph that belong on the first screen; some of `sentences`."""
+    graph: tuple[str, ...] = ()
+    """What the closures do to the graph, where that was measured; some of `sentences`."""
 
     warnings: tuple[str, ...] = ()
     """Those of them that should alarm."""

@@ -9,7 +9,8 @@ import numpy as np
 
 from taojax.audit.figures import Picture
 from taojax.audit.glossary import marked, names_of_signals
-from taojax.audit.words import UNKNOWN
+from taojax.audit.opening import UNKNOWN, Number
+from taojax.audit.opening_map import Drawing
 from taojax.specs import load_spec
 from taojax.verdicts import plain
 
@@ -42,6 +43,18 @@ class Grid(NamedTuple):
     """First cells of the rows that are shown until the reader asks for all; empty = all."""
 
 
+class Opening(NamedTuple):
+    """What a page shows first of a run: one picture and three numbers."""
+
+    drawing: Drawing
+    numbers: Sequence[Number]
+    name: str = ""
+    """Of the scenario, where the page tells of several."""
+
+    href: str = ""
+    """Its page."""
+
+
 class Page(NamedTuple):
     """Everything on one page."""
 
@@ -49,17 +62,20 @@ class Page(NamedTuple):
     subtitle: str
     notes: Sequence[str]
     headline: Sequence[str]
-    cards: Sequence[Cell]
+    """What was found, in sentences."""
+
     grids: Sequence[Grid]
     pictures: Sequence[Picture]
     facts: Mapping[str, str]
     command: str
-    links: Mapping[str, str] = {}
     lead: Sequence[str] = ()
-    """Sentences of the first screen, above the numbers; `headline` follows below them."""
+    """Sentences above everything else."""
 
-    first: Sequence[Grid] = ()
-    """Tables right below the cards."""
+    cards: Sequence[Cell] = ()
+    """Numbers below them, where the page opens with no picture."""
+
+    openings: Sequence[Opening] = ()
+    """Picture and numbers below them; all that follows is folded where there is one."""
 
     words: Mapping[str, str] = {}
     """Word -> definition; what hovering over it in a sentence tells."""
@@ -68,7 +84,7 @@ class Page(NamedTuple):
     """Heading -> name -> definition: names of signals and columns, which no sentence marks."""
 
     warnings: Sequence[str] = ()
-    """Sentences of `lead` and `headline` that should alarm."""
+    """Sentences that should alarm; those not in `lead` stand below the openings."""
 
     route: str = ""
     """JSON from `route.route_json`; empty = no section along the route."""
@@ -151,6 +167,6 @@ def render(page: Page) -> str:
         style=_beside("report.css"),
         scripts={
             "route": "".join(_beside(f"route_{part}.js") for part in ("data", "map", "panel")),
-            "hover": _beside("hover.js"),
+            "page": _beside("page.js"),
         },
     )

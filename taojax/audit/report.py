@@ -8,21 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from taojax.audit import figures, protocol, scenario_figures, summary, tables
-from taojax.audit.counts import VERDICT_FAR, VERDICT_FRR, counts_table, rates_of, rates_table
+from taojax.audit.counts import VERDICT_FAR, counts_table, rates_of, rates_table
 from taojax.audit.figures import Picture
-from taojax.audit.glossary import about, glossary, names_of_signals, names_of_tables
+from taojax.audit.glossary import glossary, names_of_signals, names_of_tables
 from taojax.audit.judgement import Evaluation, Judgement
-from taojax.audit.page import Cell, Grid, Page, grid, render
+from taojax.audit.opening import numbers, sentence, summary_sentence
+from taojax.audit.opening_map import draw_opening
+from taojax.audit.page import Grid, Opening, Page, grid, render
 from taojax.audit.route import route_json
-from taojax.audit.words import (
-    MAIN,
-    accepted_row,
-    lead_words,
-    metric_row,
-    rate,
-    span,
-    warnings,
-)
+from taojax.audit.words import MAIN, alarms, all_alarms, metric_row, rate
 from taojax.specs import read_npz, write_atomically
 
 _ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")
@@ -41,36 +35,9 @@ _RATES = (
 _FROZEN = ("signal", "threshold", "far", "frr", "delay_frames", "n_exits", "n_censored")
 
 
-def _big(value: float) -> str:
-    return "—" if np.isnan(value) else f"{value:.3f}"
-
-
-def _cards(judgement: Judgement) -> list[Cell]:
-    """Return the numbers of the first screen."""
-    test, rates = judgement.splits.test.frame, rates_of(judgement)
-    tao = metric_row(judgement, "tao")
-    verdict = judgement.verdicts["verdict"][test]
-    row = accepted_row(judgement, "final")
-    n, right, total = (int(row[name]) for name in ("accepted", "right", "right_total"))
-    shares = (
-        (_big(row["wrong_share"]), f"wrong among accepted: {n - right} of {n}", "wrong share"),
-        (_big(row["recall"]), f"right ones accepted: {right} of {total}", "recall"),
-        (f"{row['max_wrong']:g}", f"wrong at most, promised: {row['promise']}", "accepted"),
-    )
-    cards = [Cell(big, small, glossary()[word]) for big, small, word in shares]
-    cards += [
-        Cell(f"{(verdict == word).sum()}", f"{said} of {len(test)} test frames", glossary()[said])
-        for word, said in (("accept", "accepted"), ("reject", "rejected"), ("abstain", "abstained"))
-    ]
-    for name, done in ((VERDICT_FAR, "accepted"), (VERDICT_FRR, "rejected")):
-        row = rates[name]
-        counted = f"{int(row['n'])} of {int(row['n_of'])} {row['among']} test frames {done}"
-        sure = span(row, "value").partition(":")[0]
-        small = f"{name}: {counted}; {sure}" if row["n_of"] else f"{name}: no frames"
-        cards.append(Cell(_big(row["value"]), small, glossary()[name]))
-    sure = span(tao, "auroc").partition(":")[0]
-    auroc = f"AUROC of tao, {sure}, prevalence {tao['prevalence']:.2f}"
-    return [*cards, Cell(_big(tao["auroc"]), auroc, about("auroc"))]
+def _opening(done: Evaluation, name: str = "") -> Opening:
+    href = f"{name}/report.html" if name else ""
+    return Opening(draw_opening(done.judgement), numbers(done.judgement), name, href)
 
 
 def _facts(done: Evaluation) -> dict[str, str]:
@@ -114,7 +81,7 @@ def _main(title: str, table: tables.Table, columns: Sequence[str]) -> Grid:
 
 
 def _first_grids(judgement: Judgement) -> list[Grid]:
-    """Return what the sentences and cards count, so that they can be reconciled."""
+    """Return what the sentences count, so that they can be reconciled."""
     audit = judgement.config.audit
     where = (
         f"In the map: truth within {audit.r_in_m:g} m of a map pose; off the map: beyond "
@@ -161,8 +128,7 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
     judgement = done.judgement
     audit = judgement.config.audit
     dataset = judgement.manifest.get("dataset", done.run)
-    first, *others = lead_words(judgement)
-    lead = (first, *done.lead, *others)
+    lead, warned = (sentence(judgement),), alarms(done)
     # Its hash was checked before the judge began.
     found = read_npz(done.run / "retrievals.npz", "retrievals")
     return render(
@@ -175,16 +141,16 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
             ),
             notes=_notes(judgement),
             lead=lead,
-            headline=[sentence for sentence in done.sentences if sentence not in lead],
-            cards=_cards(judgement),
-            first=_first_grids(judgement),
-            grids=_run_grids(judgement),
-            pictures=pictures,
+            openings=[_opening(done)],
+            headline=[said for said in done.sentences if said not in (*lead, *warned)],
+            grids=[*_first_grids(judgement), *_run_grids(judgement)],
+            # The page opens with the map; in the folder it stands beside the other figures.
+            pictures=[drawn for drawn in pictures if drawn.name != "map"],
             facts=_facts(done),
             command=done.command,
             words=glossary(),
             terms=_terms(),
-            warnings=(*warnings(judgement), *done.warnings),
+            warnings=warned,
             route=route_json(judgement, found["index"], found["similarity"]),
         )
     )
@@ -193,7 +159,7 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
 def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> list[str]:
     said = []
     for name, done in summary.cut_maps(scenarios).items():
-        said += [f"{name}: {sentence}" for sentence in done.lead]
+        said += [f"{name}: {told}" for told in done.graph]
         tao, top1 = (metric_row(done.judgement, s) for s in ("tao", "top1"))
         far = rates_of(done.judgement)[VERDICT_FAR]
         said.append(
@@ -240,15 +206,6 @@ def _frozen_grids(frozen: tables.Table) -> list[Grid]:
     return [grid("frozen", frozen, title=title, note=_NOT_OURS, columns=columns)]
 
 
-def _summary_cards(scenarios: Mapping[str, Evaluation]) -> list[Cell]:
-    cards = []
-    for name, done in summary.cut_maps(scenarios).items():
-        row = rates_of(done.judgement)[VERDICT_FAR]
-        small = f"{name}: {VERDICT_FAR}, {span(row, 'value')}, n = {int(row['n_of'])}"
-        cards.append(Cell(_big(row["value"]), small, glossary()[VERDICT_FAR]))
-    return cards
-
-
 def write_summary(
     out: Path,
     scenarios: Mapping[str, Evaluation],
@@ -262,7 +219,7 @@ def write_summary(
         out: the folder that holds one run per scenario.
         scenarios: name -> judged run; `full` is the map that was not cut.
         command: what the user ran.
-        notes: printed on top, before those of the runs.
+        notes: printed on top; those of the runs are folded.
 
     Returns:
         What was found, in plain sentences.
@@ -276,26 +233,25 @@ def write_summary(
     mapout, recall, micro = (
         summary.mapout_table(scenarios), base.judgement.recall, base.judgement.micro,
     )  # fmt: skip
-    pictures = (
-        summary.maps(scenarios), figures.retrieval(base.judgement), *figures.strict(base.judgement),
-    )  # fmt: skip
+    pictures = (figures.retrieval(base.judgement), *figures.strict(base.judgement))
     if cut := summary.cut_maps(scenarios):
         pictures = (summary.compare(scenarios), scenario_figures.traces(cut), *pictures)
     said = {note for done in scenarios.values() for note in _notes(done.judgement)}
-    notes = [*notes, *sorted(said - set(notes))]
+    others, warned = sorted(said - set(notes)), all_alarms(scenarios)
     seals = {name: str(done.judgement.manifest["seal"]) for name, done in scenarios.items()}
-    manifest = {"schema": 1, "command": command, "notes": notes, "scenarios": seals}
+    manifest = {"schema": 1, "command": command, "notes": [*notes, *others], "scenarios": seals}
     page = Page(
         title="May these answers enter the graph? Summary over scenarios",
-        subtitle=f"{len(scenarios)} scenarios; each was scored, sealed and then judged.",
-        notes=notes,
-        headline=words,
+        subtitle=" ".join([*notes, f"{len(scenarios)} scenarios, each sealed, then judged."]),
+        notes=others,
+        lead=(summary_sentence({name: done.judgement for name, done in scenarios.items()}),),
+        openings=[_opening(done, name) for name, done in scenarios.items()],
+        headline=[told for told in words if told not in warned],
         words=glossary(),
         terms={
             "Signals": names_of_signals(),
             "Columns of the tables": names_of_tables(("mapout", "frozen", "recall", "micro")),
         },
-        cards=_summary_cards(scenarios),
         grids=[
             grid("mapout", mapout, title="Map-out scenarios beside the paper's Table 2: AUROC",
                  note=_NOT_OURS, columns=_mapout_columns("auroc")),
@@ -310,7 +266,7 @@ def write_summary(
         pictures=pictures,
         facts={f"seal of {name}": seal for name, seal in seals.items()} | {"command": command},
         command=command,
-        links={name: f"{name}/report.html" for name in scenarios},
+        warnings=warned,
     )  # fmt: skip
     files: dict[str, str | bytes] = {
         "metrics.csv": summary.joined_metrics(scenarios),
@@ -321,7 +277,8 @@ def write_summary(
         ("mapout", mapout), ("frozen", frozen), ("recall", recall), ("micro", micro),
     ):  # fmt: skip
         files |= tables.as_files(name, table)
-    for drawn in pictures:
+    # The page opens with the maps; in the folder they stand beside the other figures.
+    for drawn in (summary.maps(scenarios), *pictures):
         files |= figures.as_files(drawn)
     for name, content in files.items():
         write_atomically(out / name, content)

@@ -1,4 +1,4 @@
-// Along the route, 1 of 3: the frames as arrays, and small builders. The page joins the parts.
+// Frame by frame, 1 of 3: the frames as arrays, and small builders. The page joins the parts.
 const at = (id) => document.getElementById(id);
 const run = JSON.parse(at("route-data").textContent);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;

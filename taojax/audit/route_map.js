@@ -1,4 +1,4 @@
-// Along the route, 2 of 3: the map and the time line.
+// Frame by frame, 2 of 3: the map and the time line.
 const LEAST_HIGH = 220, MOST_HIGH = 600, EDGE = 26, FOOT = 30, ZOOMS = [1, 2, 4, 8, 16, 32];
 const view = at("route-map"), still = at("route-still"), moving = at("route-moving");
 let low = [Infinity, Infinity], high = [-Infinity, -Infinity], zoom = 0, frame = 0;

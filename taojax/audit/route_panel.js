@@ -1,4 +1,4 @@
-// Along the route, 3 of 3: the panel of the shown frame, and what hands can do.
+// Frame by frame, 3 of 3: the panel of the shown frame, and what hands can do.
 const over = (signal, i) => signal.threshold !== null && value(run.signals.indexOf(signal), i) > signal.threshold;
 const unit = (signal) => (signal.unit === "1" ? "" : ` ${signal.unit}`);
 const told = (signal) => `${signal.about}${unit(signal) && ` [${signal.unit}]`}`;

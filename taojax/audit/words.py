@@ -15,7 +15,8 @@ from taojax.audit.counts import (
     VERDICT_FRR,
     rates_of,
 )
-from taojax.audit.judgement import Judgement
+from taojax.audit.judgement import Evaluation, Judgement
+from taojax.audit.opening import TOO_SHORT, UNKNOWN, accepted_row, lines, sentence, summary_lines
 from taojax.verdicts import plain
 
 _JOIN_FRAMES = 5  # wrong acceptances this close together are told as one stretch
@@ -28,7 +29,6 @@ MAIN = (
 
 _MOST = 0.5  # beyond this share a rate is called "most"
 
-TOO_SHORT = "The recording is too short to hold a test split: nothing is scored out of sample."
 BLIND = "The calibration split holds no in-map frame, so there is no threshold."
 NO_SHIELD = (
     "Here taojax does not protect the map: do not let these closures into a graph. It accepts most "
@@ -45,10 +45,6 @@ def metric_row(judgement: Judgement, signal: str) -> dict[str, Any]:
     table = judgement.metrics
     at = list(table["signal"]).index(signal)
     return {name: values[at] for name, values in table.items()}
-
-
-UNKNOWN = "interval unknown"
-"""Said where every resample gives the same number; the glossary explains it."""
 
 
 def span(row: Mapping[str, Any], name: str) -> str:
@@ -72,35 +68,18 @@ def rate(row: Mapping[str, Any], name: str) -> str:
     return f"{row[name]:.3f} ({span(row, name)})"
 
 
-def accepted_row(judgement: Judgement, verdict: str) -> dict[str, Any]:
-    """Return one row of tables/verdicts.csv: now or final."""
-    table = judgement.accepted
-    at = list(table["verdict"]).index(verdict)
-    return {name: values[at] for name, values in table.items()}
-
-
 def _trust(judgement: Judgement) -> list[str]:
-    """Say first what a user wants to know: of the accepted, of the right, and what is promised."""
+    """Say first what a user wants to know; then on what the promise was checked."""
     if not len(judgement.splits.test.frame):
         return [TOO_SHORT]
     row, now = (accepted_row(judgement, name) for name in ("final", "now"))
-    n, right, total = (int(row[name]) for name in ("accepted", "right", "right_total"))
-    promise = f"Promised: {row['promise']}."
-    if not n:
-        return [
-            f"Of the test answers none is accepted, of {total} right ones; no closure of this "
-            f"recording should enter a graph. {promise}"
-        ]
-    shares = {"wrong_share": row["wrong_share"], "recall": row["recall"]}
-    shares |= {f"wrong_share_{end}": row[f"wrong_{end}"] for end in ("lo", "hi")}
-    shares |= {f"recall_{end}": row[f"recall_{end}"] for end in ("lo", "hi")}
-    return [
-        f"Of {n} accepted test answers {right} are right: wrong share "
-        f"{rate(shares, 'wrong_share')}. Of {total} right test answers {right} are accepted: "
-        f"recall {rate(shares, 'recall')}. {promise}",
-        f"Without waiting, {int(now['accepted'])} test answers are accepted at once, "
-        f"{int(now['right'])} of them right.",
-    ]
+    said = [sentence(judgement), f"Promised: {row['promise']}."]
+    if now["accepted"] or row["accepted"]:
+        said.append(
+            f"Without waiting, {int(now['accepted'])} test answers are accepted at once, "
+            f"{int(now['right'])} of them right."
+        )
+    return said
 
 
 def _counts(judgement: Judgement) -> list[str]:
@@ -292,30 +271,60 @@ def _decided(judgement: Judgement) -> list[str]:
     ]
 
 
-_LEAD = (_trust, _decided, _use, _counts, _false_acceptance, _failures)
+_PARTS = (
+    _trust, _decided, _use, _counts, _false_acceptance, _failures, _false_rejection, _errors,
+    _separation,
+)  # fmt: skip
 
 
 def warnings(judgement: Judgement) -> tuple[str, ...]:
     """Return those of the sentences that should alarm the reader."""
     found = {TOO_SHORT, BLIND, *_use(judgement), *_clock(judgement)}
     if _is_mostly_wrong(judgement.outcome[judgement.splits.test.frame]):
-        found.update(_trust(judgement))
-    return tuple(sentence for sentence in find_words(judgement) if sentence in found)
+        found.add(sentence(judgement))
+    return tuple(said for said in find_words(judgement) if said in found)
 
 
-def lead_words(judgement: Judgement) -> tuple[str, ...]:
-    """Return what the first screen says: what was found, how safe it is, where it fails."""
-    return tuple(sentence for part in _LEAD for sentence in part(judgement))
+def alarms(done: Evaluation) -> tuple[str, ...]:
+    """Return all that should alarm the reader of a run, the graph's part among it.
+
+    Args:
+        done: the judged run.
+    """
+    return (*warnings(done.judgement), *done.warnings)
+
+
+def all_alarms(scenarios: Mapping[str, Evaluation]) -> tuple[str, ...]:
+    """Return the same of several scenarios, each with its name.
+
+    Args:
+        scenarios: name -> judged run.
+    """
+    return tuple(f"{name}: {said}" for name, done in scenarios.items() for said in alarms(done))
+
+
+def terminal_words(done: Evaluation) -> tuple[str, ...]:
+    """Return what the terminal says of a judged run: three lines, then what should alarm.
+
+    Args:
+        done: the judged run.
+    """
+    return (*lines(done.judgement), *(f"warning: {said}" for said in alarms(done)))
+
+
+def summary_words(scenarios: Mapping[str, Evaluation]) -> tuple[str, ...]:
+    """Return what the terminal says of several scenarios: a sentence, a line each, alarms.
+
+    Args:
+        scenarios: name -> judged run.
+    """
+    judged = {name: done.judgement for name, done in scenarios.items()}
+    return (*summary_lines(judged), *(f"warning: {said}" for said in all_alarms(scenarios)))
 
 
 def find_words(judgement: Judgement) -> tuple[str, ...]:
-    """Return what was found, most important first; it begins with `lead_words`."""
-    said = [
-        sentence
-        for part in (_false_rejection, _errors, _separation)
-        for sentence in part(judgement)
-    ]
+    """Return what was found, most important first; it begins with the report's first sentence."""
+    found = [said for part in _PARTS for said in part(judgement)]
+    note = [] if judgement.detector.note in found else [judgement.detector.note]
     promised = f"Conformal threshold of tao: {judgement.promise.sentence}"
-    lead = lead_words(judgement)
-    note = [] if judgement.detector.note in lead else [judgement.detector.note]
-    return (*lead, *said, *note, promised, *_clock(judgement))
+    return (*found, *note, promised, *_clock(judgement))

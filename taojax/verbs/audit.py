@@ -173,10 +173,11 @@ def _audit_converted(args: Audit, out: Path, config: "Config") -> None:
 
 def _judge(dataset: Path, out: Path, config: "Config") -> None:
     from taojax.audit.evaluate import evaluate
+    from taojax.audit.words import terminal_words
 
     say("judging: labels, calibration, intervals from resampled blocks, figures")
     evaluation = evaluate(out, dataset / "truth", config)
-    print("\n".join(evaluation.sentences))
+    print("\n".join(terminal_words(evaluation)))
     say(f"report: {out}/report.html")
     if "own_gap_m" in evaluation.judgement.manifest:
         say(f"next:   taojax closures {out}; taojax graph {out}")
@@ -203,10 +204,12 @@ def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress
         score_apart([Scoring(folder, out / name)], config, progress=progress)
     from taojax.audit.evaluate import evaluate
     from taojax.audit.report import write_summary
+    from taojax.audit.words import summary_words
 
     for name in (only,) if only else SCENARIOS:
         say(f"judging scenario {name} (simulated)")
         evaluations[name] = evaluate(out / name, out / "data" / name / "truth", config)
     command = " ".join(["taojax", *sys.argv[1:]])
-    print("\n".join(write_summary(out, evaluations, command=command)))
+    write_summary(out, evaluations, command=command)
+    print("\n".join(summary_words(evaluations)))
     say(f"report: {out}/report.html")

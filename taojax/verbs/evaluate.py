@@ -26,10 +26,11 @@ class Evaluate(Common):
 def run(args: Evaluate) -> None:
     """Judge a sealed run."""
     from taojax.audit.evaluate import evaluate
+    from taojax.audit.words import terminal_words
     from taojax.records import read_manifest
 
     read_manifest(args.run)
     config = config_of(args, args.run / "config.toml")
     evaluation = evaluate(args.run, args.truth, config, out=args.out)
-    print("\n".join(evaluation.sentences))
+    print("\n".join(terminal_words(evaluation)))
     say(f"report: {args.out or args.run}/report.html")
