@@ -287,7 +287,7 @@ def test_real_recordings_are_ready(shared, capsys):
 def test_real_routes_without_the_rest_are_told_how_to_go_on(shared, capsys):
     code, page, errors = report(capsys, shared / "kaist_routes")
     assert code == 3
-    assert "OUT --simulate-views" in errors
+    assert "OUT --simulate-descriptors" in errors
     assert "--r-in 10 --r-out 10: a map of 861 m" in page
 
 
