@@ -65,8 +65,10 @@ def put_lists(folder, n_query=120, n_map=150, k=6, n_empty=0):
 
 
 def test_a_healthy_folder_is_told_in_full(healthy, capsys):
-    code, page, errors = report(capsys, healthy)
+    assert report(capsys, healthy)[2] == "holding every image against the map"
+    code, page, errors = report(capsys, healthy, "--no-progress", "--seed", "7")
     assert (code, errors) == (0, "")
+    assert page.rstrip().endswith("--seed 7")
     for words in (
         "map/poses.csv             ok   150 rows",
         "query/descriptors.npy     ok   120 x 16 float32",

@@ -48,8 +48,6 @@ def run(args: Inspect) -> None:
     from taojax.verbs import inspect_page as tell
     from taojax.verbs.inspect_views import lengths, likeness
 
-    said = say if args.progress else lambda text: None
-    said(f"reading {args.dataset}")
     found = check(args.dataset)
     truth = _read_truth(args.dataset, found)
     page = tell.Page([str(args.dataset)])
@@ -61,7 +59,8 @@ def run(args: Inspect) -> None:
     command = f"taojax score {quote(str(args.dataset))}"
     if shape is not None and drift_m != tell.NO_MOTION:
         radii = suggest_radii(shape, drift_m)
-        said("holding every image against the map")
+        if args.progress:
+            say("holding every image against the map")
         nearest_m = likeness(page, found, truth, shape, radii)
         if truth is not None:
             command = (
