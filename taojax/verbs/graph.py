@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from taojax.errors import InputError
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import check_seed, flag, say
 
 if TYPE_CHECKING:
     from taojax.config import AuditConfig
@@ -48,6 +48,7 @@ class Graph:
 
 def run(args: Graph) -> None:
     """Optimise, judge, write, and print what was found."""
+    check_seed(args.seed)
     from taojax.graph.optimise import check_extra
 
     check_extra()
