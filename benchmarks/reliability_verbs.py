@@ -55,7 +55,7 @@ def _convert(name: str, views: bool, folder: Path, out: Path) -> list[np.ndarray
     words: list[object] = ["convert", name, folder / "map", folder / "query", out]
     if name == "folder":
         words = ["convert", name, folder, out]
-    words += ["--simulate-views"] if not views else []
+    words += ["--simulate-descriptors"] if not views else []
     command([*words, "--query-frames", "30", "--map-frames", "40"])
     return load(out, out)
 

@@ -207,7 +207,7 @@ def test_a_recording_without_a_map_out_frame_has_no_intervals_and_says_so(tmp_pa
 def test_the_verb_writes_table_figure_and_page_and_prints_the_words(folder, tmp_path, capsys):
     out = tmp_path / "out"
     words = [str(folder / name) for name in ("plain", "weak", "near")]
-    assert main(["compare", *words, "--out", str(out)]) == 0
+    assert main(["compare", *words, "--out", str(out), "--seed", "5"]) == 0
     said = capsys.readouterr().out
     assert "weak is worse than plain in tao" in said
     names = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
@@ -219,6 +219,7 @@ def test_the_verb_writes_table_figure_and_page_and_prints_the_words(folder, tmp_
     assert set(table["run"]) == {"weak", "near"}
     assert len(table["run"]) == 2 * (2 * 6 + 4)
     facts = json.loads((out / "compare.json").read_text())
+    assert facts["seed"] == 5
     seal = records.read_manifest(folder / "near")["seal"]
     assert facts["runs"]["near"]["seal"] == seal
     page = (out / "compare.md").read_text()

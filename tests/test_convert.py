@@ -62,17 +62,20 @@ def test_help_of_every_set_shows_an_example_and_imports_nothing_heavy():
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        ([], ["--map-views", "--query-views", "--simulate-views"]),
-        (["--query-views", "q.npy"], ["--query-views", "--map-views"]),
-        (["--simulate-views", "--map-views", "m.npy"], ["--simulate-views", "--map-views"]),
-        (["--simulate-views", "--spacing-m", "2", "--map-frames", "9"], ["--spacing-m"]),
-        (["--simulate-views", "--spacing-m", "-2"], ["--spacing-m"]),
-        (["--simulate-views", "--map-frames", "0"], ["--map-frames"]),
-        (["--simulate-views", "--gate-s", "0"], ["--gate-s"]),
-        (["--simulate-views", "--least-matched", "50"], ["--least-matched"]),
-        (["--simulate-views", "--seed", "-1"], ["--seed"]),
-        (["--simulate-views", "--odometry-kind", "tum"], ["--odometry"]),
-        (["--simulate-views", "--topic", "/odom"], ["--topic", "--odometry"]),
+        ([], ["--map-descriptors", "--query-descriptors", "--simulate-descriptors"]),
+        (["--query-descriptors", "q.npy"], ["--query-descriptors", "--map-descriptors"]),
+        (
+            ["--simulate-descriptors", "--map-descriptors", "m.npy"],
+            ["--simulate-descriptors", "--map-descriptors"],
+        ),
+        (["--simulate-descriptors", "--spacing-m", "2", "--map-frames", "9"], ["--spacing-m"]),
+        (["--simulate-descriptors", "--spacing-m", "-2"], ["--spacing-m"]),
+        (["--simulate-descriptors", "--map-frames", "0"], ["--map-frames"]),
+        (["--simulate-descriptors", "--gate-s", "0"], ["--gate-s"]),
+        (["--simulate-descriptors", "--least-matched", "50"], ["--least-matched"]),
+        (["--simulate-descriptors", "--seed", "-1"], ["--seed"]),
+        (["--simulate-descriptors", "--odometry-kind", "tum"], ["--odometry"]),
+        (["--simulate-descriptors", "--topic", "/odom"], ["--topic", "--odometry"]),
     ],
 )
 def test_flags_that_contradict_or_lack_are_exit_2(words, names, tmp_path, capsys):
@@ -92,7 +95,7 @@ def test_an_unknown_set_or_a_missing_place_is_exit_2(words, capsys):
 def test_a_taken_out_is_exit_3_and_nothing_is_lost(drives, tmp_path, capsys):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/mine.txt").write_text("keep")
-    words = "--map", drives[0], "--simulate-views"
+    words = "--map", drives[0], "--simulate-descriptors"
     line = line_of(capsys, 3, "convert", "folder", drives[1], tmp_path / "out", *words)
     assert "exists already" in line
     assert (tmp_path / "out/mine.txt").read_text() == "keep"
@@ -100,7 +103,7 @@ def test_a_taken_out_is_exit_3_and_nothing_is_lost(drives, tmp_path, capsys):
 
 def test_two_drives_become_a_data_folder_with_the_odometry_of_the_query(drives, tmp_path, capsys):
     out = tmp_path / "out"
-    assert convert("folder", drives[1], out, "--map", drives[0], "--simulate-views") == 0
+    assert convert("folder", drives[1], out, "--map", drives[0], "--simulate-descriptors") == 0
     assert "40 frames" in capsys.readouterr().err
     source, made = drives[1] / "odometry.csv", out / "query/odometry.csv"
     assert table(made, "query_odometry") == pytest.approx(table(source, "query_odometry"), abs=1e-5)
@@ -115,13 +118,14 @@ def test_two_drives_become_a_data_folder_with_the_odometry_of_the_query(drives, 
 
 
 def test_one_drive_alone_is_told_to_name_its_map(drives, tmp_path, capsys):
-    words = drives[1], tmp_path / "out", "--simulate-views"
+    words = drives[1], tmp_path / "out", "--simulate-descriptors"
     assert "--map" in line_of(capsys, 2, "convert", "folder", *words)
 
 
 def test_thinning_joins_the_steps_between_the_frames_that_stay(drives, tmp_path):
     out = tmp_path / "out"
-    words = "--map", drives[0], "--simulate-views", "--query-frames", "14", "--map-frames", "30"
+    few = "--query-frames", "14", "--map-frames", "30"
+    words = "--map", drives[0], "--simulate-descriptors", *few
     assert convert("folder", drives[1], out, *words) == 0
     truth = table(out / "truth/query_poses.csv", "query_poses")
     assert len(truth) == 14
@@ -133,7 +137,7 @@ def test_frames_by_metres_count_a_stop_once(tmp_path):
     rows = [line.split(",") for line in (folder / "poses.csv").read_text().splitlines()]
     stop = [[f"{float(rows[30][0]) + 0.01 * k:.6f}", *rows[30][1:]] for k in range(40)]
     foreign.write(folder / "poses.csv", [*rows[1:30], *stop, *rows[31:]], header=",".join(rows[0]))
-    words = "--map", folder, "--simulate-views", "--spacing-m", "8"
+    words = "--map", folder, "--simulate-descriptors", "--spacing-m", "8"
     assert convert("folder", folder, tmp_path / "out", *words) == 0
     xy = table(tmp_path / "out/map/poses.csv", "map_poses")[:, 1:3]
     way = np.hypot(*np.diff(xy, axis=0).T)
@@ -149,7 +153,7 @@ def test_odometry_of_another_program_replaces_the_own(drives, tmp_path, capsys):
         for t, (x, y, theta) in zip(t_s, foreign.pose_at(t_s, 1.0), strict=True)
     ]  # fmt: skip
     foreign.write(tmp_path / "vo.txt", rows, separator=" ")
-    words = "--map", drives[0], "--simulate-views", "--odometry", tmp_path / "vo.txt"
+    words = "--map", drives[0], "--simulate-descriptors", "--odometry", tmp_path / "vo.txt"
     out = tmp_path / "out"
     assert convert("folder", drives[1], out, *words, "--odometry-kind", "tum") == 0
     assert "odometry from vo.txt (tum)" in capsys.readouterr().err
@@ -192,7 +196,7 @@ def test_retrieval_lists_of_a_frontend_come_along(drives, tmp_path):
     index = np.tile(np.arange(4, dtype=np.int32), (40, 1))
     similarity = np.tile(np.array([0.9, 0.8, 0.7, 0.6], np.float32), (40, 1))
     np.savez(tmp_path / "lists.npz", index=index, similarity=similarity)
-    words = "--map", drives[0], "--map-views", tmp_path / "lists.npz"
+    words = "--map", drives[0], "--map-descriptors", tmp_path / "lists.npz"
     assert convert("folder", drives[1], tmp_path / "out", *words) == 0
     assert np.array_equal(load_observations(tmp_path / "out").retrievals.index, index)
 
@@ -202,20 +206,20 @@ def test_sessions_of_two_places_are_refused(tmp_path, capsys):
     rows = [[row[0], f"{float(row[1]) + 450e3:.6f}", *row[2:]] for row in foreign.sthereo_rows()]
     foreign.sthereo(tmp_path / "b")
     foreign.write(tmp_path / "b/pose/global_pose.csv", rows)
-    words = tmp_path / "a", tmp_path / "b", tmp_path / "out", "--simulate-views"
+    words = tmp_path / "a", tmp_path / "b", tmp_path / "out", "--simulate-descriptors"
     line = line_of(capsys, 3, "convert", "sthereo", *words)
     assert "450 km from the first map frame" in line
     assert "one UTM zone" in line
 
 
 def test_too_few_frames_are_refused(drives, tmp_path, capsys):
-    words = "--map", drives[0], "--simulate-views", "--spacing-m", "200"
+    words = "--map", drives[0], "--simulate-descriptors", "--spacing-m", "200"
     line = line_of(capsys, 3, "convert", "folder", drives[1], tmp_path / "out", *words)
     assert "2 of the 60 map frames stay" in line
 
 
 def test_simulated_parts_follow_the_seed(drives, tmp_path):
-    words = "--map", drives[0], "--simulate-views", "--seed"
+    words = "--map", drives[0], "--simulate-descriptors", "--seed"
     (drives[1] / "odometry.csv").unlink()
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert convert("folder", drives[1], tmp_path / name, *words, seed) == 0
@@ -227,7 +231,7 @@ def test_simulated_parts_follow_the_seed(drives, tmp_path):
 
 def test_one_command_audits_a_plain_folder_with_simulated_views(drives, tmp_path, capfd):
     out = tmp_path / "run"
-    words = ["--map", drives[0], "--simulate-views", "--r-in", "3", "--out", out, *FLAGS]
+    words = ["--map", drives[0], "--simulate-descriptors", "--r-in", "3", "--out", out, *FLAGS]
     assert main(["audit", str(drives[1]), *map(str, words)]) == 0
     for name in ("data/truth/query_poses.csv", "manifest.json", "metrics.csv", "report.html"):
         assert (out / name).stat().st_size > 0, name
@@ -237,17 +241,18 @@ def test_one_command_audits_a_plain_folder_with_simulated_views(drives, tmp_path
     assert "simulated descriptors" in (out / "report.html").read_text()
 
 
-@pytest.mark.parametrize("words", [["--simulate-views"], ["x", "--map", "y"]])
+@pytest.mark.parametrize("words", [["--simulate-descriptors"], ["x", "--map", "y"]])
 def test_flags_of_a_simulated_audit_that_lack_something_are_exit_2(words, capsys):
     line = line_of(capsys, 2, "audit", *words)
-    assert "--simulate-views" in line
+    assert "--simulate-descriptors" in line
 
 
 ROBOTCAR = "robotcar_vo/2015_05_19_14_06_38", "robotcar_vo/2014_07_14_14_49_50"
 
 
 def test_real_routes_convert_with_simulated_odometry_and_views(shared, tmp_path):
-    assert convert("folder", shared / "kaist_routes", tmp_path / "out", "--simulate-views") == 0
+    words = shared / "kaist_routes", tmp_path / "out", "--simulate-descriptors"
+    assert convert("folder", *words) == 0
     seen = load_observations(tmp_path / "out")
     assert (len(seen.map_xyt), len(seen.t_s)) == (2000, 1000)
     assert any("simulated odometry" in note for note in seen.notes)
@@ -256,7 +261,7 @@ def test_real_routes_convert_with_simulated_odometry_and_views(shared, tmp_path)
 def test_real_visual_odometry_comes_through(shared, tmp_path):
     query, mapped = (shared / name for name in ROBOTCAR)
     few = "--map-frames", "500", "--query-frames", "500"
-    words = "--map", mapped, "--simulate-views", *few
+    words = "--map", mapped, "--simulate-descriptors", *few
     assert convert("folder", query, tmp_path / "out", *words) == 0
     seen = load_observations(tmp_path / "out")
     assert (len(seen.map_xyt), len(seen.t_s)) == (500, 500)

@@ -54,7 +54,7 @@ def files(folder, out, *words):
     return main(["convert", "files", str(folder / out), *full])
 
 
-VIEWS = ("--map-views", "feat_a.npy", "--query-views", "feat_b.npy")
+VIEWS = ("--map-descriptors", "feat_a.npy", "--query-descriptors", "feat_b.npy")
 STEPS = ("--odometry", "moves.npy", "--odometry-kind", "steps")
 
 
@@ -131,22 +131,23 @@ REFUSED = {
         2, ["--map-poses", "places.npy", "--odometry", "moves.npy", *VIEWS],
         ["moves.npy does not say what it holds", "steps", "poses"]),
     "no views": (
-        2, ["--map-poses", "places.npy", *STEPS], ["what do the frames look like", "--map-views"]),
+        2, ["--map-poses", "places.npy", *STEPS],
+        ["what do the frames look like", "--map-descriptors"]),
     "no map": (3, ["--map-poses", "none.npy", *STEPS], ["none.npy", "(--map-poses)"]),
     "other rows": (
         3, ["--map-poses", "places.npy", "--query-poses", "where.npy", "--odometry", "places.npy",
             "--odometry-kind", "steps", *VIEWS],
         ["places.npy", "60 rows without stamps, but the query has 40 frames"]),
     "views of the other side": (
-        3, ["--map-poses", "places.npy", *STEPS, "--map-views", "feat_b.npy", "--query-views",
-            "feat_b.npy"], ["feat_b.npy", "40 rows", "60 frames"]),
+        3, ["--map-poses", "places.npy", *STEPS, "--map-descriptors", "feat_b.npy",
+            "--query-descriptors", "feat_b.npy"], ["feat_b.npy", "40 rows", "60 frames"]),
     "motions for poses": (
         3, ["--map-poses", "wheels.txt", *STEPS, *VIEWS], ["wheels.txt", "holds motions"]),
     "an array of a program": (
         3, ["--map-poses", "places.npy", "--odometry", "moves.npy", "--odometry-kind", "tum",
             *VIEWS], ["moves.npy", "kind is steps or poses"]),
     "nothing to simulate from": (
-        3, ["--map-poses", "places.npy", *STEPS, "--simulate-views"], ["without poses"]),
+        3, ["--map-poses", "places.npy", *STEPS, "--simulate-descriptors"], ["without poses"]),
 }  # fmt: skip
 
 

@@ -30,7 +30,7 @@ def converted(tmp_path, capsys, kind, *words):
     """Convert a pair with simulated views; return the data folder and what was said."""
     out = tmp_path / "out"
     pair = str(tmp_path / "map"), str(tmp_path / "query")
-    assert main(["convert", kind, *pair, str(out), "--simulate-views", *words]) == 0
+    assert main(["convert", kind, *pair, str(out), "--simulate-descriptors", *words]) == 0
     return load_observations(out), capsys.readouterr().err
 
 
@@ -93,7 +93,7 @@ def test_complex_urban_drives_on_wheels_and_gyro_where_they_are_there(tmp_path, 
     assert "odometry from query (wheels)" in said
     (tmp_path / "query/calibration/EncoderParameter.txt").unlink()
     words = [str(tmp_path / name) for name in ("map", "query", "again")]
-    assert main(["convert", "complex-urban", *words, "--simulate-views"]) == 0
+    assert main(["convert", "complex-urban", *words, "--simulate-descriptors"]) == 0
     assert "simulated odometry" in capsys.readouterr().err
 
 
@@ -164,7 +164,7 @@ def test_vivid_frames_are_images_or_the_list_of_them(tmp_path, capsys, shown):
 def test_vivid_without_images_and_lists_takes_the_positions(tmp_path):
     foreign.vivid(tmp_path / "map", shown=False)
     assert len(read_vivid(tmp_path / "map").frames) == 300
-    with pytest.raises(InputError, match="--images"):
+    with pytest.raises(InputError, match="--frames"):
         read_vivid(tmp_path / "map", images="img/color")
 
 
@@ -311,7 +311,7 @@ def test_a_broken_sequence_is_exit_3_with_file_row_and_fix(kind, how, tmp_path, 
     write(tmp_path / "map")
     breaks(write(tmp_path / "query"))
     words = [str(tmp_path / name) for name in ("map", "query", "out")]
-    assert main(["convert", kind, *words, "--simulate-views"]) == 3
+    assert main(["convert", kind, *words, "--simulate-descriptors"]) == 3
     line = capsys.readouterr().err.strip()
     assert line.startswith(f"taojax: {tmp_path / 'query'}"), line
     assert "\n" not in line

@@ -29,7 +29,7 @@ def xyt(path, spec):
 
 def test_a_pair_of_sequences_becomes_a_data_folder_that_loads(pair, tmp_path, capsys):
     out = tmp_path / "out"
-    words = ["--simulate-views", "--query-frames", "20"]
+    words = ["--simulate-descriptors", "--query-frames", "20"]
     assert main(["convert", "sthereo", *map(str, pair), str(out), *words]) == 0
     said = capsys.readouterr().err
     assert "58 of 58 frames have a pose within 0.5 s (interpolated)" in said
@@ -158,7 +158,7 @@ def test_other_sensors_are_held_against_their_specs(pair, imu_columns, tmp_path,
     foreign.sensors(pair[0], imu_columns=imu_columns)
     assert check_sensors(pair[0]) == ("data_stamp.csv", "gps.csv", "inspva.csv", "xsens_imu.csv")
     assert check_sensors(pair[1]) == ()
-    words = ["convert", "sthereo", *map(str, pair), str(tmp_path / "out"), "--simulate-views"]
+    words = ["convert", "sthereo", *map(str, pair), str(tmp_path / "out"), "--simulate-descriptors"]
     assert main(words) == 0
     assert "specs: data_stamp.csv, gps.csv, inspva.csv, xsens_imu.csv" in capsys.readouterr().err
 
@@ -170,7 +170,12 @@ def test_descriptors_of_all_images_fit_though_some_have_no_pose(pair, tmp_path, 
     for name, array in zip(("map", "query"), views, strict=True):
         np.save(tmp_path / f"{name}.npy", array)
     out = tmp_path / "out"
-    words = ["--map-views", str(tmp_path / "map.npy"), "--query-views", str(tmp_path / "query.npy")]
+    words = [
+        "--map-descriptors",
+        str(tmp_path / "map.npy"),
+        "--query-descriptors",
+        str(tmp_path / "query.npy"),
+    ]
     assert main(["convert", "sthereo", *map(str, pair), str(out), *words]) == 0
     # Poses begin at 10 s: the ten frames before 9.5 s have none.
     assert np.array_equal(np.load(out / "map/descriptors.npy"), views[0][10:])
@@ -187,7 +192,7 @@ def test_real_lines_of_frame_lists_load(shared, tmp_path):
     assert np.diff(session.poses.t_s)[:2] == pytest.approx([0.100046, 19.999999], abs=1e-6)
     assert len(session.frames) == 10
     out = tmp_path / "out"
-    assert main(["convert", "sthereo", *map(str, lists), str(out), "--simulate-views"]) == 0
+    assert main(["convert", "sthereo", *map(str, lists), str(out), "--simulate-descriptors"]) == 0
     seen = load_observations(out)
     assert len(seen.t_s) == 8
     assert any("frame list" in note for note in seen.notes)
@@ -327,7 +332,7 @@ def refused(capsys, tmp_path, words):
 def test_a_broken_sequence_is_exit_3_with_file_row_and_fix(how, pair, tmp_path, capsys):
     breaks, where, fix = BROKEN[how]
     breaks(pair[0])
-    line = refused(capsys, tmp_path, ["sthereo", *map(str, pair), "--simulate-views"])
+    line = refused(capsys, tmp_path, ["sthereo", *map(str, pair), "--simulate-descriptors"])
     assert where in line
     assert fix in line
 
@@ -336,7 +341,12 @@ def test_descriptors_of_the_other_endianness_are_read_and_said(pair, tmp_path, c
     views = rng.normal(size=(58, 8))
     np.save(tmp_path / "map.npy", views.astype(">f4"))
     np.save(tmp_path / "query.npy", views.astype(np.float32))
-    words = ["--map-views", str(tmp_path / "map.npy"), "--query-views", str(tmp_path / "query.npy")]
+    words = [
+        "--map-descriptors",
+        str(tmp_path / "map.npy"),
+        "--query-descriptors",
+        str(tmp_path / "query.npy"),
+    ]
     out = tmp_path / "out"
     assert main(["convert", "sthereo", *map(str, pair), str(out), *words]) == 0
     assert "map.npy: big-endian numbers are read as float32" in capsys.readouterr().err

@@ -34,7 +34,7 @@ SAID = {
 def convert(folder, out, *more):
     """Run the command on the five files of a folder, or on what replaces them."""
     named = {"--map-poses": "m.txt", "--odometry": "o.txt", "--query-poses": "q.txt",
-             "--map-views": "mv.npy", "--query-views": "qv.npy"}  # fmt: skip
+             "--map-descriptors": "mv.npy", "--query-descriptors": "qv.npy"}  # fmt: skip
     words = [str(folder / word) if (folder / word).is_file() else word for word in more]
     for flag, name in named.items():
         if flag not in words:
@@ -339,7 +339,7 @@ OTHERS = {
     "a query row twice": ("q.txt", twice(text(TUM)), [], "q.txt: 1 row repeats a stamp"),
     "a map row twice": ("m.txt", twice(text(TUM)), [], "m.txt: 1 row repeats a stamp"),
     "query rows late, views by time": (
-        "q.txt", swapped(text(TUM)), ["--views-order", "time"], "q.txt: 1 row came late"),
+        "q.txt", swapped(text(TUM)), ["--descriptors-order", "time"], "q.txt: 1 row came late"),
     "positions alone": ("m.txt", text([X, Y], ",", "x,y"), [], "m.txt: headings are derived"),
     "no stamps in the query": (
         "q.txt", text([X, Y, THETA], ",", "x,y,theta"), [], "as the query frames have no time"),
@@ -364,9 +364,9 @@ def test_late_rows_of_images_ask_what_the_descriptors_follow(order, plain, tmp_p
     assert convert(plain, tmp_path / "out") == 3
     line = capsys.readouterr().err
     assert "qv.npy: data rows 21 and 22 of its poses came late" in line
-    assert "--views-order" in line
+    assert "--descriptors-order" in line
     assert not (tmp_path / "out").exists()
-    assert convert(plain, tmp_path / "out", "--views-order", order) == 0
+    assert convert(plain, tmp_path / "out", "--descriptors-order", order) == 0
     rows = np.load(plain / "qv.npy")
     if order == "rows":
         rows[[20, 21]] = rows[[21, 20]]
@@ -435,7 +435,7 @@ def test_descriptors_that_are_none_are_refused(shape, plain, tmp_path, capsys):
 
 def test_the_only_array_of_an_archive_may_have_any_name(plain, tmp_path):
     np.savez(plain / "a.npz", features=ROWS[:, None])
-    assert convert(plain, tmp_path / "out", "--map-views", "a.npz") == 0
+    assert convert(plain, tmp_path / "out", "--map-descriptors", "a.npz") == 0
     assert np.array_equal(np.load(tmp_path / "out/map/descriptors.npy"), ROWS)
 
 
@@ -475,13 +475,13 @@ def test_query_and_truth_are_added_to_a_map(plain, tmp_path, capsys):
         # UTM coordinates: the origin has to be remembered.
         body = text([T_S, X + 350_000.0, Y + 4_000_000.0, *TUM[3:]])
         (plain / name).write_text(body)
-    assert grown(out, "--map-poses", plain / "m.txt", "--map-views", plain / "mv.npy") == 0
+    assert grown(out, "--map-poses", plain / "m.txt", "--map-descriptors", plain / "mv.npy") == 0
     assert not (out / "query").exists()
-    added = "--odometry", plain / "o.txt", "--query-views", plain / "qv.npy"
+    added = "--odometry", plain / "o.txt", "--query-descriptors", plain / "qv.npy"
     assert grown(out, *added) == 0
     assert "added query/odometry.csv, query/descriptors.npy" in capsys.readouterr().err
     assert not (out / "truth").exists()
-    assert grown(out, "--truth-poses", plain / "q.txt") == 0
+    assert grown(out, "--query-poses", plain / "q.txt") == 0
     assert "added truth/query_poses.csv" in capsys.readouterr().err
     assert convert(plain, whole_out) == 0
     for name in ("map/poses.csv", "query/odometry.csv", "truth/query_poses.csv",
@@ -498,8 +498,11 @@ def test_nothing_that_is_there_is_overwritten(plain, tmp_path, capsys):
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     for words, there in (
-        (("--truth-poses", plain / "q.txt"), "truth/query_poses.csv"),
-        (("--odometry", plain / "o.txt", "--query-views", plain / "qv.npy"), "query/odometry.csv"),
+        (("--query-poses", plain / "q.txt"), "truth/query_poses.csv"),
+        (
+            ("--odometry", plain / "o.txt", "--query-descriptors", plain / "qv.npy"),
+            "query/odometry.csv",
+        ),
         (("--map-poses", plain / "m.txt", "--odometry", plain / "o.txt"), "map/poses.csv"),
     ):
         assert grown(out, *words) == 3
@@ -511,22 +514,22 @@ def test_nothing_that_is_there_is_overwritten(plain, tmp_path, capsys):
 
 def test_truth_at_any_rate_is_brought_to_the_frames(plain, tmp_path, capsys):
     out = tmp_path / "out"
-    query = "--odometry", plain / "o.txt", "--query-views", plain / "qv.npy"
-    views = "--map-views", plain / "mv.npy"
+    query = "--odometry", plain / "o.txt", "--query-descriptors", plain / "qv.npy"
+    views = "--map-descriptors", plain / "mv.npy"
     assert grown(out, "--map-poses", plain / "m.txt", *views, *query) == 0
     dense = np.linspace(T_S[0] - 1, T_S[-1] + 1, 20 * N)
     rows = [dense, np.interp(dense, T_S, X), np.interp(dense, T_S, Y), np.interp(dense, T_S, THETA)]
     (plain / "gps.csv").write_text(text(rows, ",", "time,east,north,yaw"))
-    assert grown(out, "--truth-poses", plain / "gps.csv") == 0
+    assert grown(out, "--query-poses", plain / "gps.csv") == 0
     got = np.loadtxt(out / "truth/query_poses.csv", delimiter=",", skiprows=1)
     assert got == pytest.approx(np.c_[T_S, XYT], abs=2e-2)
     (out / "truth/query_poses.csv").unlink()
     (plain / "gps.csv").write_text(text([c[:300] for c in rows], ",", "time,east,north,yaw"))
     capsys.readouterr()
-    assert grown(out, "--truth-poses", plain / "gps.csv") == 3
+    assert grown(out, "--query-poses", plain / "gps.csv") == 3
     assert "gps.csv: knows " in capsys.readouterr().err
 
 
 def test_without_a_map_nothing_can_be_added(plain, tmp_path, capsys):
-    assert grown(tmp_path / "none", "--truth-poses", plain / "q.txt") == 2
+    assert grown(tmp_path / "none", "--query-poses", plain / "q.txt") == 2
     assert "give --map-poses" in capsys.readouterr().err

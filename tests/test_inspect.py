@@ -65,8 +65,10 @@ def put_lists(folder, n_query=120, n_map=150, k=6, n_empty=0):
 
 
 def test_a_healthy_folder_is_told_in_full(healthy, capsys):
-    code, page, errors = report(capsys, healthy)
+    assert report(capsys, healthy)[2] == "holding every image against the map"
+    code, page, errors = report(capsys, healthy, "--no-progress", "--seed", "7")
     assert (code, errors) == (0, "")
+    assert page.rstrip().endswith("--seed 7")
     for words in (
         "map/poses.csv             ok   150 rows",
         "query/descriptors.npy     ok   120 x 16 float32",
@@ -287,7 +289,7 @@ def test_real_recordings_are_ready(shared, capsys):
 def test_real_routes_without_the_rest_are_told_how_to_go_on(shared, capsys):
     code, page, errors = report(capsys, shared / "kaist_routes")
     assert code == 3
-    assert "OUT --simulate-views" in errors
+    assert "OUT --simulate-descriptors" in errors
     assert "--r-in 10 --r-out 10: a map of 861 m" in page
 
 

@@ -27,7 +27,7 @@ PARTLY = {
                     ["it holds a.npy, b.npy, c.txt, d/ and 1 more", "taojax convert files"]),
     "one drive": (["poses.csv"], ["this is one drive", "--map FOLDER_OF_THE_MAP"]),
     "poses alone": (["map/poses.csv", "truth/query_poses.csv"],
-                    ["lacks query/odometry.csv and map/descr", "OUT --simulate-views"]),
+                    ["lacks query/odometry.csv and map/descr", "OUT --simulate-descriptors"]),
     "half a pair": (["map/poses.csv", "query/odometry.csv", "queries_descriptors.npy"],
                     ["lacks database_descriptors.npy and truth/query_poses.csv"]),
     "no truth": (["map/poses.csv", "query/odometry.csv", "query/retrievals.npz"],

@@ -64,6 +64,9 @@ class Comparison(NamedTuple):
     runs: tuple[Judged, ...]
     scopes: tuple[Scope, ...]
     block_frames: int
+    seed: int
+    """Of the resamples."""
+
     table: tables.Table
     """Columns of data_specs/compare.toml."""
 
@@ -159,12 +162,11 @@ def _check_same(runs: Sequence[Judged]) -> None:
             raise InputError(f"{pair}: {what}; {fix}")
 
 
-def _scopes(runs: Sequence[Judged]) -> tuple[int, tuple[Scope, ...]]:
+def _scopes(runs: Sequence[Judged], seed: int) -> tuple[int, tuple[Scope, ...]]:
     """Return the block length, and the frames and resamples that all runs share."""
     block = max(max(int(r.audit["audit"]["block_frames"]), 2 * int(r.audit["gap_frames"]))
                 for r in runs)  # fmt: skip
     most = max(int(run.audit["audit"]["n_bootstrap"]) for run in runs)
-    seed = int(runs[0].audit.get("seed", 0))
     held = np.flatnonzero(np.all([run.split == "test" for run in runs], axis=0))
     frames = {"all": np.arange(len(runs[0].label)), "test": held}
     return block, tuple(
@@ -254,11 +256,12 @@ def names_of(paths: Sequence[Path]) -> list[str]:
     return [re.sub(r"[^\w./+-]", "_", name) for name in called]
 
 
-def compare(paths: Sequence[Path]) -> Comparison:
+def compare(paths: Sequence[Path], seed: int | None = None) -> Comparison:
     """Measure judged runs on the same frames, each against the first.
 
     Args:
         paths: two or more run folders of one recording, judged with the same radii.
+        seed: of the resamples; None: the first run's.
 
     Raises:
         InputError: a run twice, not judged, with a broken seal, or of another recording.
@@ -267,6 +270,7 @@ def compare(paths: Sequence[Path]) -> Comparison:
         raise InputError(f"{paths[-1]}: a run is named twice; name each once")
     runs = tuple(read_judged(*pair) for pair in zip(paths, names_of(paths), strict=True))
     _check_same(runs)
-    block, scopes = _scopes(runs)
+    seed = int(runs[0].audit.get("seed", 0)) if seed is None else seed
+    block, scopes = _scopes(runs, seed)
     rows = [row for run in runs[1:] for row in _rows(run, runs[0], scopes)]
-    return Comparison(runs, scopes, block, tables.from_rows("compare", rows))
+    return Comparison(runs, scopes, block, seed, tables.from_rows("compare", rows))

@@ -216,7 +216,7 @@ def write(found: Comparison, out: Path, command: str) -> None:
         "truth_sha256": found.runs[0].audit.get("truth_sha256"),
         "block_frames": found.block_frames,
         "n_bootstrap": len(found.scopes[0].weights),
-        "seed": int(found.runs[0].audit.get("seed", 0)),
+        "seed": found.seed,
     }
     parts = [
         f"# {', '.join(run.name for run in found.runs)}",

@@ -400,7 +400,7 @@ def _with_all(
                 f"data rows {place[at + 1] + 1} and {place[at] + 1} of its poses came late: its"
                 " rows may follow those, or the time"
             )
-            raise fail(path, what, "add --views-order rows or --views-order time")
+            raise fail(path, what, "add --descriptors-order rows or --descriptors-order time")
     return Session(session.listed, session.poses, session.has_pose), place[kept]
 
 

@@ -53,7 +53,7 @@ def read_vivid(
     track = folder / "gpslist.txt"
     is_shown = (folder / images).is_dir()
     if not is_shown and images != IMAGES:
-        raise fail(folder / images, "no such folder of images", "choose another --images")
+        raise fail(folder / images, "no such folder of images", "choose another --frames")
     path = track if is_shown or not listed.is_file() else listed
     if path == track and not track.exists() and listed.is_file():
         path = listed

@@ -60,6 +60,7 @@ def first_steps() -> list[Row]:
     with tempfile.TemporaryDirectory() as cache:
         known = {
             "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_ENABLE_COMPILATION_CACHE": "true",
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
         return [

@@ -48,11 +48,11 @@ class Audit(Common):
     scenario: Annotated[Scenario | None, flag("full|default|h3|h4", "all four")] = None
     """Run one scenario of the simulated world alone."""
 
-    simulate_views: bool = False
+    simulate_descriptors: bool = False
     """DATASET is a plain folder with poses: simulate what it lacks, as `taojax convert folder`."""
 
     map: Annotated[Path | None, flag("FOLDER", "DATASET holds it")] = None
-    """With --simulate-views: folder of the map drive, where DATASET is the query drive alone."""
+    """With --simulate-descriptors: folder of the map drive; DATASET is the query drive alone."""
 
     self: Annotated[bool, flag("", "False")] = False
     """DATASET is one drive that closes on itself: a frame's map is what lies --gap-m behind it.
@@ -70,7 +70,7 @@ def run(args: Audit) -> None:
     """Audit a data folder, two folders of images or the simulated world."""
     _check(args)
     has_images = are_asked(args.images)
-    is_ready = args.dataset is not None and not args.simulate_views and not args.self
+    is_ready = args.dataset is not None and not args.simulate_descriptors and not args.self
     if args.dataset is not None and is_ready:
         check_layout(args.dataset, has_truth=True)
     if args.dataset is not None and args.self:
@@ -93,20 +93,20 @@ def run(args: Audit) -> None:
 def _check(args: Audit) -> None:
     """Refuse flags that contradict each other."""
     if are_asked(args.images) and (
-        args.dataset is not None or args.scenario or args.simulate_views or args.self
+        args.dataset is not None or args.scenario or args.simulate_descriptors or args.self
     ):
         raise UsageError(
-            "--map-images stands in the place of DATASET, --scenario, --simulate-views and --self;"
-            " drop one of them"
+            "--map-images stands in the place of DATASET, --scenario, --simulate-descriptors and"
+            " --self; drop one of them"
         )
     if args.dataset is not None and args.scenario is not None:
         raise UsageError("--scenario names a part of the simulated world; drop it or DATASET")
-    if args.simulate_views and args.dataset is None:
-        raise UsageError("--simulate-views completes a DATASET; name one")
-    if args.map is not None and not args.simulate_views:
-        raise UsageError("--map goes with --simulate-views")
-    if args.self and (args.dataset is None or args.simulate_views):
-        raise UsageError("--self audits one DATASET as it is; name it and drop --simulate-views")
+    if args.simulate_descriptors and args.dataset is None:
+        raise UsageError("--simulate-descriptors completes a DATASET; name one")
+    if args.map is not None and not args.simulate_descriptors:
+        raise UsageError("--map goes with --simulate-descriptors")
+    if args.self and (args.dataset is None or args.simulate_descriptors):
+        raise UsageError("--self takes one DATASET as it is; name it, drop --simulate-descriptors")
     if args.gap_m is not None and not args.self:
         raise UsageError("--gap-m goes with --self")
 
@@ -151,7 +151,7 @@ def _convert(args: Audit, data: Path, seed: int) -> None:
         convert.make_self(Self(folder=args.dataset, out=data, gap_m=args.gap_m, seed=seed))
         return
     convert.make(
-        Folder(folder=args.dataset, out=data, map=args.map, simulate_views=True, seed=seed)
+        Folder(folder=args.dataset, out=data, map=args.map, simulate_descriptors=True, seed=seed)
     )
 
 

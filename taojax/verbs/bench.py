@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from taojax.errors import InputError
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import Compiling, check_seed, flag, say
 
 if TYPE_CHECKING:
     from taojax.runtime.bench import Drive
 
 
 @dataclasses.dataclass(frozen=True)
-class Bench:
+class Bench(Compiling):
     """Measure step, replay, retrieval and the rivals in one run; only ratios travel.
 
     Example: taojax bench --quick --out runs/bench/mine
@@ -28,8 +28,14 @@ class Bench:
     gate: Annotated[Path | None, flag("FILE.csv", "none")] = None
     """Exit with code 5 where a ratio is worse than this baseline allows."""
 
+    seed: int = 0
+    """Seed of the simulated drive that is timed."""
 
-def simulated_drive(n_frames: int) -> "Drive":
+    progress: bool = True
+    """Say what is being measured."""
+
+
+def simulated_drive(n_frames: int, seed: int = 0) -> "Drive":
     """Return the first frames of the simulated world, no segment of its map deleted."""
     import numpy as np
 
@@ -37,7 +43,7 @@ def simulated_drive(n_frames: int) -> "Drive":
     from taojax.runtime.bench import Drive
     from taojax.runtime.retrieval import dense, retrieve
 
-    world = make_world(WorldConfig(), 0)
+    world = make_world(WorldConfig(), seed)
     queries = world.query_descriptors[:n_frames]
     index, similarity = retrieve(world.map_descriptors, queries)
     return Drive(
@@ -52,6 +58,7 @@ def simulated_drive(n_frames: int) -> "Drive":
 
 def run(args: Bench) -> None:
     """Measure, write, and hold against a baseline."""
+    check_seed(args.seed)
     from taojax.runtime import bench
 
     out = args.out or Path("runs") / "bench" / time.strftime("%Y%m%d-%H%M%S")
@@ -59,7 +66,8 @@ def run(args: Bench) -> None:
         raise InputError(f"{out}: already holds a benchmark; choose a new --out")
     if args.gate is not None and not args.gate.is_file():
         raise InputError(f"{args.gate}: no such file; make one with `python -m benchmarks speed`")
-    rows = bench.measure(simulated_drive(300), quick=args.quick, say=say)
+    tell = say if args.progress else lambda text: None
+    rows = bench.measure(simulated_drive(300, args.seed), quick=args.quick, say=tell)
     bench.write_rows(rows, out / "bench.csv")
     for row in rows:
         print(f"{row.name:30s} {row.value:12.4g} {row.unit}")

@@ -31,8 +31,16 @@ def flag(metavar: str, default: str) -> Any:
 Dataset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Compiling:
+    """Flag of the verbs that compile."""
+
+    cache: bool = True
+    """Keep what is compiled for the next command, in the user's cache folder."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Common:
+class Common(Compiling):
     """Flags shared by the verbs; each wins over the config file."""
 
     out: Annotated[Path | None, flag("DIR", "runs/<verb>/<time>-<config hash>")] = None
@@ -74,6 +82,16 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def check_seed(seed: int | None) -> None:
+    """Refuse a seed that no generator takes.
+
+    Raises:
+        UsageError: it is negative.
+    """
+    if seed is not None and seed < 0:
+        raise UsageError(f"--seed {seed} must not be negative")
+
+
 def config_of(args: Common, base: Path | None = None) -> "Config":
     """Return the settings of the config file, of `base` or the defaults, with the flags on top."""
     from taojax import config as settings
@@ -95,7 +113,7 @@ def told(args: Common, config: "Config") -> str:
     """Return all that decides what a command makes, to know it again."""
     from taojax.config import to_toml
 
-    return f"{dataclasses.replace(args, out=None, progress=True)!r}\n{to_toml(config)}"
+    return f"{dataclasses.replace(args, out=None, progress=True, cache=True)!r}\n{to_toml(config)}"
 
 
 def out_of(args: Common, verb: str, config: "Config") -> Path:

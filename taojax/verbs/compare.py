@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from taojax.errors import UsageError
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import check_seed, flag, say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,18 +28,22 @@ class Compare:
     out: Annotated[Path | None, flag("DIR", "runs/compare/<time>-<hash of the seals>")] = None
     """Folder to make."""
 
+    seed: Annotated[int | None, flag("INT", "the first run's")] = None
+    """Seed of the bootstrap."""
+
 
 def run(args: Compare) -> None:
     """Compare runs, print what is beyond chance, write table and figure."""
     if len(args.runs) < 2:
         raise UsageError("compare needs at least two runs")
+    check_seed(args.seed)
     from taojax.audit.compare import compare
     from taojax.audit.compare_report import sentences, write
     from taojax.records import refuse_if_taken
 
     if args.out is not None:
         refuse_if_taken(args.out)
-    found = compare(args.runs)
+    found = compare(args.runs, args.seed)
     out = args.out
     if out is None:
         seals = "".join(run.manifest["seal"] for run in found.runs)

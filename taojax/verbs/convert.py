@@ -8,7 +8,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from taojax.errors import InputError, UsageError
-from taojax.verbs.common import say
+from taojax.verbs.common import check_seed, say
 from taojax.verbs.convert_flags import (
     ComplexUrban,
     Convert,
@@ -54,6 +54,7 @@ def make_self(data: Self) -> None:
     from taojax.datasets.own_map import GAP_M, write_own_map
     from taojax.verbs.layout import check_folder
 
+    check_seed(data.seed)
     gap_m = GAP_M if data.gap_m is None else data.gap_m
     if not gap_m > 0:
         raise UsageError(f"--gap-m {data.gap_m} must be positive")
@@ -94,9 +95,9 @@ def _add(data: Files) -> None:
 
     reading = reading_of(data, is_motion=False)
     out, truth = data.out, data.query_poses
-    if data.map_poses is not None and data.map_views is not None:
+    if data.map_poses is not None and data.map_descriptors is not None:
         mapped = read_session(data.map_poses, data.map_poses.parent, reading)
-        added = additions.make_map(out, mapped, data.map_views)
+        added = additions.make_map(out, mapped, data.map_descriptors)
     elif truth is not None and (out / "query/odometry.csv").exists() and data.odometry is None:
         added = additions.add_truth(
             out, truth, reading, gate_s=data.gate_s, offset_s=data.clock_offset
@@ -111,16 +112,17 @@ def _add(data: Files) -> None:
 
 
 def _is_map_alone(data: Files) -> bool:
-    return data.odometry is None and data.query_poses is None and data.query_views is None
+    return data.odometry is None and data.query_poses is None and data.query_descriptors is None
 
 
 def _check_flags(data: Data) -> None:
     """Refuse flags that contradict each other or ask for nothing."""
-    if data.simulate_views and (data.map_views or data.query_views):
-        raise UsageError("--simulate-views replaces --map-views and --query-views; drop one")
+    if data.simulate_descriptors and (data.map_descriptors or data.query_descriptors):
+        given = "--map-descriptors and --query-descriptors"
+        raise UsageError(f"--simulate-descriptors replaces {given}; drop one")
     may_lack = isinstance(data, Files) and data.map_poses is None
-    if data.query_views is not None and data.map_views is None and not may_lack:
-        raise UsageError("--query-views goes with --map-views")
+    if data.query_descriptors is not None and data.map_descriptors is None and not may_lack:
+        raise UsageError("--query-descriptors goes with --map-descriptors")
     if data.spacing_m is not None and (data.map_frames or data.query_frames):
         raise UsageError("--spacing-m chooses frames by metres; drop it or the numbers of frames")
     for name in ("map_frames", "query_frames", "spacing_m", "gate_s"):
@@ -129,8 +131,7 @@ def _check_flags(data: Data) -> None:
             raise UsageError(f"--{name.replace('_', '-')} {value} must be positive")
     if not 0 <= data.least_matched <= 1:
         raise UsageError(f"--least-matched {data.least_matched} is a share from 0 to 1")
-    if data.seed < 0:
-        raise UsageError(f"--seed {data.seed} must not be negative")
+    check_seed(data.seed)
     _check_motion_flags(data)
 
 
@@ -148,7 +149,7 @@ def _check_places(data: Data) -> None:
     if isinstance(data, Files):
         _check_parts(data)
     flags = ("map", "query", "folder", "map_poses", "query_poses", "odometry", "times",
-             "map_views", "query_views")  # fmt: skip
+             "map_descriptors", "query_descriptors")  # fmt: skip
     for name in flags:
         path = getattr(data, name, None)
         if path is not None and not path.exists():
@@ -168,7 +169,7 @@ def _check_parts(data: Files) -> None:
     if data.map_poses is not None and has_map:
         fix = "leave --map-poses away to add to this folder, or choose a new one"
         raise InputError(f"{data.out}: exists already and holds map/poses.csv; {fix}")
-    if _is_map_alone(data) and (data.map_poses is None or data.map_views is None):
+    if _is_map_alone(data) and (data.map_poses is None or data.map_descriptors is None):
         raise UsageError("what is known of the query? Give --odometry, --query-poses or both")
 
 
@@ -230,13 +231,13 @@ def _views(data: Data) -> "tuple[Path, Path | None] | None":
     """Return the files of descriptors or lists; None: they are simulated."""
     from taojax.datasets.convert import recorded_views
 
-    if data.simulate_views:
+    if data.simulate_descriptors:
         return None
-    if data.map_views is not None:
-        return data.map_views, data.query_views
+    if data.map_descriptors is not None:
+        return data.map_descriptors, data.query_descriptors
     held = data.out / "map/descriptors.npy"
-    if isinstance(data, Files) and data.query_views is not None and held.is_file():
-        return held, data.query_views
+    if isinstance(data, Files) and data.query_descriptors is not None and held.is_file():
+        return held, data.query_descriptors
     own = recorded_views(data.folder, data.map) if isinstance(data, Folder) else None
     if own is None:
         looked = ""
@@ -247,8 +248,8 @@ def _views(data: Data) -> "tuple[Path, Path | None] | None":
             if data.map is not None:
                 looked = f"{data.map} and {data.folder} hold no descriptors.npy each; "
         raise UsageError(
-            f"what do the frames look like? {looked}give --map-views and --query-views, or"
-            " --simulate-views"
+            f"what do the frames look like? {looked}give --map-descriptors and"
+            " --query-descriptors, or --simulate-descriptors"
         )
     return own
 
@@ -266,7 +267,7 @@ def _choices(data: Data) -> "Choices":
         gate_s=data.gate_s,
         motion=_motion(data),
         views=views,
-        views_order=data.views_order,
+        views_order=data.descriptors_order,
         seed=data.seed,
     )
 
@@ -325,7 +326,7 @@ def _robotcar(data: Robotcar, matching: "Matching") -> "Sessions":
 def _vivid(data: Vivid, matching: "Matching") -> "Sessions":
     from taojax.datasets.vivid import read_vivid
 
-    read = partial(read_vivid, images=data.images, matching=matching)
+    read = partial(read_vivid, images=data.frames, matching=matching)
     return read(data.map), read(data.query)
 
 

@@ -13,11 +13,6 @@ Kind = Literal[
 ]
 
 
-def _alias(metavar: str, default: str, name: str) -> Any:
-    hint = f"(default: {default})"
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, aliases=(name,))
-
-
 def _place(metavar: str) -> Any:
     return tyro.conf.arg(metavar=metavar)
 
@@ -88,17 +83,17 @@ class Making(Formats):
     odometry: Annotated[Path | None, flag("FILE", "the set's own, else simulated")] = None
     """Odometry of the query session."""
 
-    views_order: Annotated[Literal["rows", "time"] | None, flag("rows|time", "asked")] = None
+    descriptors_order: Annotated[Literal["rows", "time"] | None, flag("rows|time", "asked")] = None
     """What descriptors follow where rows of poses came late: the rows of that file, or time."""
 
-    map_views: Annotated[Path | None, flag("FILE", "none")] = None
-    """Descriptors of the map images (npy, npz, h5); or, without --query-views, one file that
+    map_descriptors: Annotated[Path | None, flag("FILE", "none")] = None
+    """Descriptors of the map images (npy, npz, h5); or, without --query-descriptors, one file that
     answers for both: retrieval lists (npz, csv), a similarity matrix (npy), an hloc h5."""
 
-    query_views: Annotated[Path | None, flag("FILE", "none")] = None
+    query_descriptors: Annotated[Path | None, flag("FILE", "none")] = None
     """Descriptors of the query images."""
 
-    simulate_views: bool = False
+    simulate_descriptors: bool = False
     """Simulate the descriptors of both sessions from their poses; the report says so."""
 
     seed: int = 0
@@ -123,7 +118,7 @@ class Pair(Making):
 class Sthereo(Pair):
     """STheReO: two folders with image/ and pose/, or two frame lists.
 
-    Example: taojax convert sthereo kaist_morning kaist_evening OUT --simulate-views
+    Example: taojax convert sthereo kaist_morning kaist_evening OUT --simulate-descriptors
     """
 
     camera: str = "stereo_thermal_14_left"
@@ -137,7 +132,8 @@ class Sthereo(Pair):
 class Kri(Pair):
     """NUFR-KRI: image sequences without poses; the position is the progress along the route.
 
-    Example: taojax convert kri kri_day_2 kri_night OUT --map-views day.npy --query-views night.npy
+    Example: taojax convert kri kri_day_2 kri_night OUT --map-descriptors day.npy
+    --query-descriptors night.npy
     """
 
     camera: str = "cam_3"
@@ -154,7 +150,7 @@ class Kri(Pair):
 class Mulran(Pair):
     """MulRan: two folders with global_pose.csv.
 
-    Example: taojax convert mulran KAIST01 KAIST02 OUT --simulate-views
+    Example: taojax convert mulran KAIST01 KAIST02 OUT --simulate-descriptors
     """
 
     frames: Annotated[str | None, flag("SUBFOLDER", "lidar, radar or the poses themselves")] = None
@@ -165,7 +161,7 @@ class Mulran(Pair):
 class ComplexUrban(Pair):
     """KAIST Complex Urban: two folders with global_pose.csv; wheels and gyro are the odometry.
 
-    Example: taojax convert complex-urban urban28 urban38 OUT --simulate-views
+    Example: taojax convert complex-urban urban28 urban38 OUT --simulate-descriptors
     """
 
     frames: Annotated[str | None, flag("SUBFOLDER", "left camera or the poses themselves")] = None
@@ -176,7 +172,8 @@ class ComplexUrban(Pair):
 class Robotcar(Pair):
     """Oxford RobotCar: two traverses with gps/; vo/vo.csv is the odometry.
 
-    Example: taojax convert robotcar 2014-07-14-14-49-50 2015-05-19-14-06-38 OUT --simulate-views
+    Example: taojax convert robotcar 2014-07-14-14-49-50 2015-05-19-14-06-38 OUT
+    --simulate-descriptors
     """
 
     camera: str = "stereo/centre"
@@ -190,10 +187,10 @@ class Robotcar(Pair):
 class Vivid(Pair):
     """ViViD++: two driving sequences with gpslist.txt or thermal_gps_framelist.txt.
 
-    Example: taojax convert vivid campus_day1 campus_night OUT --simulate-views
+    Example: taojax convert vivid campus_day1 campus_night OUT --simulate-descriptors
     """
 
-    images: str = "img/thermal_fieldscale_clahe"
+    frames: str = "img/thermal_fieldscale_clahe"
     """Folder whose files, named by their time in seconds, are the frames."""
 
 
@@ -201,7 +198,8 @@ class Vivid(Pair):
 class Folder(Making):
     """A folder of your own; or, with --map, two folders of one drive each.
 
-    Example: taojax convert folder my_recording OUT --map-views map.npy --query-views query.npy
+    Example: taojax convert folder my_recording OUT --map-descriptors map.npy
+    --query-descriptors query.npy
     """
 
     folder: Annotated[Path, tyro.conf.Positional, _place("FOLDER")]
@@ -220,7 +218,7 @@ class Files(Making):
     """Single files of any name: .npy, csv, TUM, KITTI, EuRoC or g2o.
 
     Example: taojax convert files OUT --map-poses places.npy --odometry moves.npy --odometry-kind
-    steps --query-poses slam.txt --map-views a.npy --query-views b.npy
+    steps --query-poses slam.txt --map-descriptors a.npy --query-descriptors b.npy
     """
 
     out: Annotated[Path, tyro.conf.Positional, _place("OUT")]
@@ -230,9 +228,7 @@ class Files(Making):
     """Poses of the map images: an .npy of (M, 3) x, y, theta or (M, 4) with the stamp first, a
     table with names such as t,x,y,theta, or what another program wrote."""
 
-    query_poses: Annotated[
-        Path | None, _alias("FILE", "nobody knows them: no audit", "--truth-poses")
-    ] = None
+    query_poses: Annotated[Path | None, flag("FILE", "nobody knows them: no audit")] = None
     """True poses of the query images, one each, in the same kinds of files; where OUT holds a query
     already, any that cover its time."""
 
@@ -262,7 +258,7 @@ class Self:
 class Convert:
     """Make a data folder of a public data set or of your own recordings.
 
-    Example: taojax convert sthereo kaist_morning kaist_evening OUT --simulate-views
+    Example: taojax convert sthereo kaist_morning kaist_evening OUT --simulate-descriptors
     """
 
     data: Annotated[

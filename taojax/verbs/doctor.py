@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from taojax.verbs.common import Compiling
+
 PACKAGES = (
     "taojax", "jax", "jaxlib", "equinox", "optimistix", "numpy", "pandas", "matplotlib",
     "scikit-learn",
@@ -33,7 +35,7 @@ N_CALLS = 20
 
 
 @dataclasses.dataclass(frozen=True)
-class Doctor:
+class Doctor(Compiling):
     """Look at this machine: versions, devices, cache, extras, and how long a step takes.
 
     Example: taojax doctor --json
@@ -176,8 +178,8 @@ def advice(found: dict[str, Any]) -> list[str]:
         said.append(f"an NVIDIA GPU is there, but jax runs on the CPU; run: {how}")
     if jax["cache"] is None:
         said.append(
-            "every program compiles the step again; to keep it on disk: "
-            "export JAX_COMPILATION_CACHE_DIR=~/.cache/jax"
+            "every command compiles again; drop --no-cache and JAX_ENABLE_COMPILATION_CACHE; where "
+            "the cache folder cannot be written, export JAX_COMPILATION_CACHE_DIR=FOLDER"
         )
     if jax["x64"]:
         said.append("x64 is on: robot code needs float32 alone; run: unset JAX_ENABLE_X64")
@@ -217,7 +219,7 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     else:
         rows += [
             ("step", "runs", "yes" if step["is_finite"] else "yes, but gives numbers not finite"),
-            ("step", "first call", f"{step['first_s']:g} s, compiling"),
+            ("step", "first call", f"{step['first_s']:g} s, compiling what is not cached"),
             ("step", "next calls", f"{step['next_ms']:g} ms in the median of {N_CALLS}, "
              f"{step['slowest_next_ms']:g} ms at most"),
         ]  # fmt: skip

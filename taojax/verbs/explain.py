@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import Compiling, flag, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Explain:
+class Explain(Compiling):
     """Say why a frame got its verdict: its path, disagreeing frames, other places, margin, picture.
 
     Example: taojax explain runs/mine --frame 812

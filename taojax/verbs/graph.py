@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from taojax.errors import InputError
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import check_seed, flag, say
 
 if TYPE_CHECKING:
     from taojax.config import AuditConfig
@@ -39,9 +39,16 @@ class Graph:
     r_out: Annotated[float | None, flag("M", "as evaluated, else 10")] = None
     """An answer or a pose farther than this from the truth is wrong, metres."""
 
+    seed: Annotated[int | None, flag("INT", "none")] = None
+    """Changes nothing: no optimiser here draws by chance. Taken as by the other verbs."""
+
+    progress: bool = True
+    """Say what is being optimised."""
+
 
 def run(args: Graph) -> None:
     """Optimise, judge, write, and print what was found."""
+    check_seed(args.seed)
     from taojax.graph.optimise import check_extra
 
     check_extra()
@@ -58,9 +65,10 @@ def run(args: Graph) -> None:
     window = int(facts.get("gap_frames", config.stream.window))
     out = args.out or args.run
     command = f"taojax graph {args.run} --truth {truth}"
+    tell = (lambda name: say(f"optimising {name}")) if args.progress else lambda name: None
     found = write_graph(
         args.run, sealed, truth, audit, window,
-        out=out, command=command, say=lambda name: say(f"optimising {name}"),
+        out=out, command=command, say=tell,
     )  # fmt: skip
     print("\n".join(found))
     say(f"written to {out}/graph.html, tables/graph.csv and figures/graph.png")

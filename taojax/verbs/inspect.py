@@ -3,12 +3,12 @@
 import dataclasses
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from taojax.errors import InputError
-from taojax.verbs.common import Dataset
+from taojax.verbs.common import Compiling, Dataset, check_seed, flag, say
 from taojax.verbs.layout import TRUTH, advice, check_folder, missing
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ LEAST_MATCHED = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Inspect:
+class Inspect(Compiling):
     """Look at a data folder before a long run: what is there, what is wrong, what to expect.
 
     Example: taojax inspect my_data
@@ -32,9 +32,16 @@ class Inspect:
     anyway: bool = False
     """Do not refuse where the truth knows less than half of the query stamps."""
 
+    seed: Annotated[int | None, flag("INT", "0")] = None
+    """Seed of the command that is suggested; what is found here does not depend on chance."""
+
+    progress: bool = True
+    """Say what takes long."""
+
 
 def run(args: Inspect) -> None:
     """Print what was found; refuse a folder that cannot be scored or judged."""
+    check_seed(args.seed)
     check_folder(args.dataset)
     from taojax.runtime.checkup import check
     from taojax.runtime.radii import suggest_radii
@@ -52,6 +59,8 @@ def run(args: Inspect) -> None:
     command = f"taojax score {quote(str(args.dataset))}"
     if shape is not None and drift_m != tell.NO_MOTION:
         radii = suggest_radii(shape, drift_m)
+        if args.progress:
+            say("holding every image against the map")
         nearest_m = likeness(page, found, truth, shape, radii)
         if truth is not None:
             command = (
@@ -63,7 +72,7 @@ def run(args: Inspect) -> None:
     elif drift_m == tell.NO_MOTION:
         page.end("not ready: mend the odometry and inspect again")
     else:
-        page.end("ready; next", command)
+        page.end("ready; next", command if args.seed is None else f"{command} --seed {args.seed}")
     print("\n".join(page.lines))
     if refusal:
         raise InputError(f"{args.dataset}: {refusal}")

@@ -85,7 +85,8 @@ def advice(folder: Path) -> str:
         return f"this is one drive: taojax convert folder {name} OUT --map FOLDER_OF_THE_MAP"
     has_poses = any((folder / name).is_file() for name in (TRUTH, "query/poses.csv"))
     if (folder / "map/poses.csv").is_file() and has_poses:
-        return f"`taojax convert folder {name} OUT --simulate-views` simulates what is missing"
+        command = f"taojax convert folder {name} OUT --simulate-descriptors"
+        return f"`{command}` simulates what is missing"
     return f"{holds(folder)}; `taojax convert files` takes files of any name"
 
 

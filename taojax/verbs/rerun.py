@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from taojax.errors import GateError, InputError
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import Compiling, flag, say
 from taojax.verbs.from_images import FOLDER
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ PLACE = ("dataset", "command")
 
 
 @dataclasses.dataclass(frozen=True)
-class Rerun:
+class Rerun(Compiling):
     """Score a sealed run again, from its manifest and config.toml, and compare with the seal.
 
     Exit code 0 where signals and answers are the same or within tolerance, else 5.

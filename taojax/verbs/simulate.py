@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from taojax.verbs.common import Scenario, say
+from taojax.verbs.common import Scenario, check_seed, say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Simulate:
 
 def run(args: Simulate) -> None:
     """Write the world."""
+    check_seed(args.seed)
     from taojax.datasets.edit import scenario
     from taojax.datasets.simulate import WorldConfig, make_world
     from taojax.datasets.world import write_world

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from taojax.verbs.common import flag, say
+from taojax.verbs.common import Compiling, flag, say
 
 
 @dataclasses.dataclass(frozen=True)
-class Watch:
+class Watch(Compiling):
     """Judge a live stream: one JSON line per frame on stdin, verdict lines on stdout.
 
     In: {"t_s": 0.1, "odometry": [dx_m, dy_m, dtheta_rad], "index": [...], "similarity": [...]}.
@@ -63,7 +63,7 @@ def run(args: Watch) -> None:
         say(f"careful: {said}")
     if own is None:
         say(f"note: decided with {SHIPPED}: no frame of this place has set its level")
-    say("compiling for some 5 to 20 s")
+    say("compiling for some 20 s; where an earlier command has compiled it, less")
     start = time.perf_counter()
     watcher = Watcher(config, loaded.tables, used)
     say(f"ready: map of {len(loaded.tables.places.grid.xy)} places, {loaded.scale}; "
