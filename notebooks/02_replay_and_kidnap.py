@@ -60,8 +60,8 @@ for log, distance in zip(logs, error, strict=True):
 print(f"{np.isfinite(found).mean():.0%} of {len(found)} recovered, median {np.median(found):.0f}")
 
 # %% [markdown]
-# Between the jump and the recovery nothing may be believed: the frames do not fit on the path of the
-# old answer, and `tao` is high. The first log, with its jumps dashed:
+# Between the jump and the recovery nothing may be believed: the frames do not fit on the path of
+# the old answer, and `tao` is high. The first log, with its jumps dashed:
 
 # %%
 status = np.array(STATUSES)[np.asarray(records.status)]

@@ -16,8 +16,8 @@
 # Two simulated worlds with the same road and the same deleted map segments. In the first the
 # similarity *level* separates: what is off the map looks like nothing in it. In the second places
 # alias: what is off the map looks exactly like somewhere else. A similarity gate can only work in
-# the first. The path of the filter's answer (`tao`) works in both, as long as the odometry disagrees
-# with the alias.
+# the first. The path of the filter's answer (`tao`) works in both, as long as the odometry
+# disagrees with the alias.
 
 # %%
 import jax.numpy as jnp

@@ -44,7 +44,7 @@ def made_up(name="cost", middle=0.5, gain=8.0, **changes):
 def features(columns, is_wrong, rng, numbers):
     """Return made-up features of answers, on which shipped numbers tell most wrong from right."""
     n = len(is_wrong)
-    loud = np.where(is_wrong, 0.5, -0.5) + 0.3 * rng.normal(size=n)
+    loud = np.where(is_wrong, 0.5, -0.5) + 0.2 * rng.normal(size=n)
     found = {name: rng.normal(size=n) for name in columns}
     for name, mean, scale, weight in zip(
         numbers.columns, numbers.mean, numbers.scale, numbers.weight, strict=True

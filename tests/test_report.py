@@ -218,8 +218,9 @@ def test_terms_on_the_page_add_up_to_the_probability(held):
             *(model[k] for k in ("columns", "mean", "scale", "weight")), strict=True
         )
     ]
-    odds = np.sum(terms, axis=0) + done.judgement.detector.bias
-    np.testing.assert_allclose(1 / (1 + np.exp(-odds)), values[-1], atol=1e-5)
+    odds = np.sum(terms, axis=0) + done.judgement.calibration.final.bias
+    at = [signal["name"] for signal in found["signals"]].index("probability_wrong")
+    np.testing.assert_allclose(1 / (1 + np.exp(-odds)), values[at], atol=1e-5)
 
 
 def test_a_long_run_is_thinned_and_says_so(held, monkeypatch):

@@ -61,7 +61,7 @@ class Audit(Common):
     gap_m: Annotated[float | None, flag("M", "50")] = None
     """With --self: way between a frame and the newest one that it may close on, metres."""
 
-    images: Annotated[FromImages, tyro.conf.OmitArgPrefixes] = dataclasses.field(
+    from_images: Annotated[FromImages, tyro.conf.OmitArgPrefixes] = dataclasses.field(
         default_factory=FromImages
     )
 
@@ -69,7 +69,7 @@ class Audit(Common):
 def run(args: Audit) -> None:
     """Audit a data folder, two folders of images or the simulated world."""
     _check(args)
-    has_images = are_asked(args.images)
+    has_images = are_asked(args.from_images)
     is_ready = args.dataset is not None and not args.simulate_descriptors and not args.self
     if args.dataset is not None and is_ready:
         check_layout(args.dataset, has_truth=True)
@@ -92,7 +92,7 @@ def run(args: Audit) -> None:
 
 def _check(args: Audit) -> None:
     """Refuse flags that contradict each other."""
-    if are_asked(args.images) and (
+    if are_asked(args.from_images) and (
         args.dataset is not None or args.scenario or args.simulate_descriptors or args.self
     ):
         raise UsageError(
@@ -129,7 +129,7 @@ def _audit_images(args: Audit, out: Path, config: "Config") -> None:
 
     if not (out / "manifest.json").is_file():
         refuse_if_taken(out)
-    data, truth_csv = make(args.images, out.parent / FOLDER, progress=args.progress)
+    data, truth_csv = make(args.from_images, out.parent / FOLDER, progress=args.progress)
     if (out / "manifest.json").is_file() and not is_sealed(out, data, config):
         raise InputError(f"{out}: holds a run of other images, files or flags; choose a new --out")
     score_apart([Scoring(data, out)], config, progress=args.progress)
