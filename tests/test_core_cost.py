@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from taojax.core import cost as cost_module
 from taojax.core import procrustes
 from taojax.core.cost import Branch, CostParams, branch_cost, huber
-from taojax.core.procrustes import AngleEvidence, diagnose, fit_se2
+from taojax.core.procrustes import VectorPairs, diagnose, fit_se2
 from taojax.core.se2 import compose, transform
 
 N = 12
 one = eqx.filter_jit(branch_cost)
 many = eqx.filter_jit(jax.vmap(branch_cost, in_axes=(None, None, 0, None)))
-fit = jax.jit(lambda p, q, weight, prior: fit_se2(p, q, weight, prior=prior))
+fit = jax.jit(fit_se2)
 
 
 def params(lam=1.0, gamma=1.0, tau=1.0, delta=3.0, mask=9.0):
@@ -65,13 +65,10 @@ def test_closed_form_equals_the_svd_route(kind, lam, rng):
     p, q = KINDS[kind](rng)
     w = rng.uniform(0.1, 1.0, N)
     w /= w.sum()
-    dp, dq = np.diff(p, axis=0), np.diff(q, axis=0)
+    steps = (np.diff(x, axis=0, prepend=x[:1]) for x in (p, q))
     with jax.enable_x64(True):
-        more = AngleEvidence(
-            jnp.asarray(2 * lam * np.mean(np.sum(dp * dq, axis=1))),
-            jnp.asarray(2 * lam * np.mean(dp[:, 0] * dq[:, 1] - dp[:, 1] * dq[:, 0])),
-            jnp.asarray(1.0),
-        )
+        share = jnp.full(N, 2 * lam / (N - 1)).at[0].set(0.0)
+        more = VectorPairs(*map(jnp.asarray, steps), share)
         got = fit(jnp.asarray(p), jnp.asarray(q), jnp.asarray(w), more)
     assert not bool(got.is_degenerate)
     np.testing.assert_allclose(got.T_map_odom, reference.fit(p, q, w, lam), atol=1e-8)

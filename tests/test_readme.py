@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 import taojax
 from benchmarks import __main__ as benchmarks
-from taojax.audit import calibration
 from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
 from taojax.cli import main
 from taojax.runtime.rivals import SYSTEMS
@@ -107,8 +106,9 @@ def test_every_file_of_the_project_that_a_page_names_exists(page):
 
 
 def test_readme_and_guide_stay_short():
-    assert len(README.split()) <= 2500
-    assert len(GUIDE.split()) <= 2500
+    n_words = lambda page: sum(bool(re.search(r"\w", part)) for part in page.split())
+    assert n_words(README) <= 1500
+    assert n_words(GUIDE) <= 2500
 
 
 def test_pictures_are_small_and_shown_somewhere():
@@ -126,7 +126,6 @@ def test_the_signal_of_the_guide_is_one_and_goes_where_the_guide_says():
     assert '"margin": signals.margin(similarity),' in (ROOT / "taojax/runtime/stream.py").read_text(
         encoding="utf-8"
     )
-    assert calibration.BLURRED.keys() == calibration.DISTINCT.keys()
 
 
 def test_the_baseline_of_the_guide_is_a_rival(rng):

@@ -100,7 +100,6 @@ def fit_se2(
     q: Float[Array, "n *k 2"],
     weight: Float[Array, "n *k"],
     *more: VectorPairs,
-    prior: AngleEvidence | None = None,
 ) -> RigidFit:
     r"""Find the SE(2) transform that best carries local points p onto anchors q.
 
@@ -116,8 +115,6 @@ def fit_se2(
             its scale sets the balance against what follows.
         more: n further pairs each that share the rotation but not the shift: the velocity term of
             Eq. 1 is the steps of p and q with weights 2 lambda / (number of steps).
-        prior: evidence known beforehand: a heading prior kappa (1 - cos(theta - theta0)) is
-            kappa (cos theta0, sin theta0, 1).
 
     Returns:
         `T_map_odom` (x [m], y [m], theta [rad]) and `is_degenerate`: no weight, or nothing fixes
@@ -130,8 +127,7 @@ def fit_se2(
     p = trailing(p, weight)
     p_mean, q_mean = weighted_mean(p, weight), weighted_mean(q, weight)
     centred = p - p_mean[None], q - q_mean[None]
-    found = angle_evidence(VectorPairs(*centred, weight), *more)
-    dot, cross, scale = found if prior is None else map(jnp.add, found, prior)
+    dot, cross, scale = angle_evidence(VectorPairs(*centred, weight), *more)
     # Relative, so that millimetres and kilometres are judged alike, and written so that NaN is bad.
     tolerance = 100.0 * jnp.finfo(p.dtype).eps
     strength = _safe_sqrt(dot**2 + cross**2)
