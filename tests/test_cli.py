@@ -264,7 +264,7 @@ def test_simulate_writes_a_folder_that_scores(tmp_path):
 
 def test_a_reader_that_has_seen_enough_is_no_error(data_folder):
     words = [sys.executable, "-c", "from taojax.cli import main; raise SystemExit(main())"]
-    words += ["inspect", str(data_folder)]
+    words += ["inspect", str(data_folder), "--no-progress"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
         child.stdout.close()
         assert child.stderr.read() == b""
