@@ -1,20 +1,16 @@
 """Strict JAX settings for every test, and small data folders to run on."""
 
-import atexit
+import contextlib
 import os
-import shutil
-import tempfile
+import time
 import zlib
 from pathlib import Path
 
 # Subprocesses and tests share nothing but the CPU: no accelerator, no preallocation.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Commands are tried in fresh interpreters, which would compile the same programs over and over.
-# Workers inherit the folder of the process that starts them.
-if "PYTEST_XDIST_WORKER" not in os.environ:
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="taojax-tests-")
-    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+# Workers, commands in fresh interpreters and the next session share what is compiled.
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(__file__).parents[1] / ".pytest_cache" / "jax")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 # The oldest JAX alarms at every entry that it reads, though it wrote it itself.
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
@@ -25,8 +21,18 @@ import pytest
 ALONE = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
 """For processes that compile side by side, or whose own compiling is what is tried."""
 
+WEEK_S = 7 * 24 * 3600
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_sessionstart():
+    """Forget what was compiled a week ago: most of it is of code that has changed."""
+    for entry in Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).glob("*-cache"):
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - entry.stat().st_mtime > WEEK_S:
+                entry.unlink()
 
 
 @pytest.fixture

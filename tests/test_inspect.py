@@ -86,7 +86,7 @@ def test_a_healthy_folder_is_told_in_full(healthy, capsys):
         assert words in page
     *_, ready, _, command = page.splitlines()
     assert ready.startswith("ready; next")
-    assert command == f"taojax audit {healthy} --r-in 5 --r-out 10"
+    assert command == f"taojax audit {healthy} --r-in 5 --r-out 10 --seed 7"
 
 
 def test_a_folder_without_truth_can_be_scored(folder, capsys):
