@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from benchmarks import ablation, concepts, gallery, pictures, sets, speed
 from benchmarks.ablation import Cell
-from taojax.config import StreamConfig
 from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError
 from taojax.runtime.bench import Row
@@ -20,8 +19,8 @@ TABLE = {
     "tao: all ingredients": {"real": Cell(0.92, 0.30), "made, up": Cell(0.99, 0.01)},
     "tao: no re-fit": {"real": Cell(0.80, 0.55), "made, up": Cell(0.991, 0.01)},
     "tao: twice delta": {"real": Cell(0.95, 0.20), "made, up": Cell(0.98, 0.05)},
-    "probability, test half: all parts": {"real": Cell(0.99), "made, up": Cell(0.998)},
-    "probability, test half: without tao": {"real": Cell(0.97), "made, up": Cell(0.998)},
+    "final verdict: all features": {"real": Cell(0.99), "made, up": Cell(0.998)},
+    "final verdict: without tao": {"real": Cell(0.97), "made, up": Cell(0.998)},
 }
 
 
@@ -54,10 +53,7 @@ def test_the_csv_of_an_ablation_holds_every_cell_and_no_far_for_the_probability(
 
 
 def test_a_run_measures_every_variant_on_every_set_it_was_asked_for(tmp_path, monkeypatch):
-    small = StreamConfig(window=5, branches=8, association="rank")
-    monkeypatch.setattr(ablation, "StreamConfig", lambda **_: small)
     monkeypatch.setattr(ablation, "SETTINGS", {"all ingredients": {}})
-    monkeypatch.setattr(ablation, "SWAPS", {})
     world = WorldConfig(n_map=220, n_query=160, dimension=32, offset_m=4.0, odometry_scale=0.0)
     made = sets.simulated(world, 3, "default", name="tiny/3", column="tiny")
     recipe = sets.Recipe("tiny/3", lambda: dataclasses.replace(made, r_in_m=30.0, r_out_m=40.0))
@@ -67,7 +63,7 @@ def test_a_run_measures_every_variant_on_every_set_it_was_asked_for(tmp_path, mo
     assert said[0] == "[1/1] tiny/3"
     with open(tmp_path / "out/ablation.csv", newline="") as file:
         rows = {row["variant"]: row for row in csv.DictReader(file)}
-    assert {"tao: all ingredients", "probability, test half: without entropy"} <= set(rows)
+    assert {"tao: all ingredients", "final verdict: without vote"} <= set(rows)
     for row in rows.values():
         assert 0.0 <= float(row["auroc"]) <= 1.0
 

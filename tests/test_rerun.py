@@ -224,7 +224,7 @@ def other_index(raw):
 FORGED = {
     "a signal": ("signals.csv", cell(9, "tao", lambda v: str(float(v) + 0.01)), "tao in 1 rows"),
     "a row number": ("signals.csv", cell(9, "map_index", lambda v: str(int(v) + 1)), "map_index"),
-    "a status": ("signals.csv", cell(9, "status", lambda v: "gone"), "gone"),
+    "a status": ("signals.csv", cell(9, "status", lambda v: "degenerate"), "status in 1 rows"),
     "a blank pose": ("signals.csv", cell(9, "x_m", lambda v: ""), "x_m in 1 rows, first row 9"),
     "a stamp": ("signals.csv", cell(9, "t_s", lambda v: "9.0001"), "t_s in 1 rows, first row 9"),
     "a map pose": ("map_poses.csv", lambda raw: raw.replace(b"\n3.0,", b"\n3.5,"), "t_s in 1 rows"),

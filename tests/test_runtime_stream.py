@@ -169,17 +169,14 @@ def test_frames_without_candidates_are_flagged_and_the_stream_recovers(rng):
     _, records = replay(SMALL, tables, gone)
     assert STATUSES[int(records.status[20])] == "no_candidates"
     assert finite(records)
-    # The carried branch bridges the gap; a rank branch cannot.
-    assert np.linalg.norm(records.pose[20, :2] - loop(T)[20, :2]) < 3 * float(tables.spacing_m)
-    _, rank = replay(RANK, tables, gone)
-    assert int(rank.map_index[20]) == -1
-    assert not bool(rank.has_pose[20])
+    # Nothing is said of the frame; the next one is where it would have been.
+    assert int(records.map_index[20]) == -1
+    assert not bool(records.has_pose[20])
+    assert np.linalg.norm(records.pose[21, :2] - loop(T)[21, :2]) < 3 * float(tables.spacing_m)
     _, healthy = replay(SMALL, tables, frames)
     after = slice(20 + SMALL.window, None)
-    for name, rtol in (("tao_rank", 1e-5), ("tao", 1e-2)):
-        a, b = records.signals[name][after], healthy.signals[name][after]
-        # The running similarity scale remembers one answer less; nothing else may differ.
-        np.testing.assert_allclose(a, b, rtol=rtol)
+    a, b = (r.signals["tao_rank"][after] for r in (records, healthy))
+    np.testing.assert_allclose(a, b, rtol=1e-5)
 
 
 @pytest.mark.parametrize("field", ["odometry", "similarity"])
@@ -190,10 +187,14 @@ def test_nan_in_one_frame_hurts_only_the_windows_that_contain_it(field, rng):
     _, records = replay(SMALL, tables, Frame(**broken))
     assert finite(records)
     _, healthy = replay(SMALL, tables, frames)
-    for name, rtol in (("tao", 1e-2), ("tao_rank_vel", 1e-5), ("support", 1e-5), ("sue", 1e-5)):
+    for name in ("tao_rank_vel", "support", "sue"):
         a, b = np.asarray(records.signals[name]), np.asarray(healthy.signals[name])
         np.testing.assert_array_equal(a[:12], b[:12])
-        np.testing.assert_allclose(a[12 + SMALL.window :], b[12 + SMALL.window :], rtol=rtol)
+        np.testing.assert_allclose(a[12 + SMALL.window :], b[12 + SMALL.window :], rtol=1e-5)
+    # The filter looks three windows back: the frame stands in the path without support.
+    tao, unharmed = (np.asarray(r.signals["tao"]) for r in (records, healthy))
+    np.testing.assert_array_equal(tao[:12], unharmed[:12])
+    np.testing.assert_allclose(tao[-1], unharmed[-1], atol=0.1)
 
 
 ODD = {

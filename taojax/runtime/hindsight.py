@@ -118,7 +118,7 @@ def init(config: VerdictConfig, tables: MapTables) -> State:
     return State(
         belief=uninformed(config, tables.places.grid.xy.shape[0], tables.places.n_known),
         pending=jnp.zeros(3),
-        past=Seen(jnp.zeros((p, 3)), jnp.full((p, LISTED), -1), jnp.zeros((p, LISTED))),
+        past=Seen(jnp.zeros((p, 3)), jnp.full((p, LISTED), -1, jnp.int32), jnp.zeros((p, LISTED))),
         answers=jnp.zeros((p, 3)),
         pace=jnp.zeros(p),
         weight=jnp.zeros(p),
