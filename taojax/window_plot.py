@@ -156,7 +156,7 @@ def draw_window(marks: WindowMarks, *, is_close: bool, ax: Axes) -> Axes:
             ax.scatter(*path[chosen].T, s=size, color=colour, marker=marker, linewidths=1.1,
                        label=label, zorder=5)  # fmt: skip
     (left, right), (low, high) = (
-        _limits(path, marks.anchor_m)
+        _limits(path, marks.anchor_m[agrees])
         if is_close
         else _limits(marks.map_m, path, marks.place[:, :2])
     )
