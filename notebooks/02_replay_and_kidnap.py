@@ -65,7 +65,7 @@ print(f"{np.isfinite(found).mean():.0%} of {len(found)} recovered, median {np.me
 
 # %%
 status = np.array(STATUSES)[np.asarray(records.status)]
-believed = (status == "ok") & (np.asarray(records.signals["tao"]) < 0.5)
+believed = (status == "ok") & (np.asarray(records.signals["tao"]) < 0.3)
 figure, ax = plt.subplots(figsize=(9, 3), layout="constrained")
 ax.semilogy(error[0] + 0.1, color="#0072B2", linewidth=1.0)
 ax.plot(np.flatnonzero(believed[0]), error[0][believed[0]] + 0.1, ".", color="#009E73")

@@ -16,7 +16,7 @@ HOLDS = {
     "02_replay_and_kidnap": (
         "len(found) >= 12",
         "np.isfinite(found).all()",
-        "np.median(found) <= 4",
+        "np.median(found) <= 8",
         "wrong < 1.0",
     ),
     # The calibrated probability beats the gate on the test half.

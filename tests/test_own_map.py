@@ -126,7 +126,7 @@ def test_padding_changes_no_belief(rng):
     config = VerdictConfig()
     plain = map_tables(np.c_[loop(60)], None)
     more = growing.padded(plain)
-    assert more.grid.xy.shape[0] == growing.LEAST_PADDED
+    assert more.places.grid.xy.shape[0] == growing.LEAST_PADDED
     found = []
     for tables in (plain, more):
         places, m = tables.places, tables.places.grid.xy.shape[0]

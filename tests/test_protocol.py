@@ -70,7 +70,7 @@ def test_a_model_is_frozen_once_on_the_first_scenario_with_both_classes(model, s
     done, row = scenarios["h3"], row_of(table, "h3", model)
     assert row["once_on"] == "default"
     assert row["once_threshold"] == numbers.threshold
-    p = probability(numbers, done.judgement.signals)
+    p = probability(numbers, done.judgement.signals | done.judgement.delayed)
     tested = p[half(done, "test", "map_out")]
     assert row["once_far"] == pytest.approx(np.mean(tested <= numbers.threshold))
     assert row["once_threshold"] != row["threshold"]

@@ -21,5 +21,5 @@ def test_every_anchor_of_an_evenly_spaced_line_finds_itself(spacing_m, axis):
 def test_every_anchor_of_a_lattice_finds_itself():
     x, y = np.meshgrid(np.arange(20.0), np.arange(15.0), indexing="ij")
     poses = np.c_[x.ravel(), y.ravel(), np.zeros(300)] * 2.0
-    grid = map_tables(poses).grid
+    grid = map_tables(poses).places.grid
     np.testing.assert_array_equal(look_up(grid, grid.xy), np.arange(300))

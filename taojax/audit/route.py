@@ -88,7 +88,13 @@ def _signals(judgement: Judgement) -> list[dict[str, Any]]:
             }
         )
     return found + [
-        {"name": name, "unit": "1", "about": features[name]["about"], "threshold": None}
+        {
+            "name": name,
+            "unit": "1",
+            "about": features[name]["about"],
+            "threshold": None,
+            "feature": True,
+        }
         for name in judgement.calibration.final.columns
     ]
 

@@ -25,10 +25,11 @@ const fillTerms = (i) => {
       cell(number(value(columns[j], i)) + unit(signal)), bar(excess[j], widest),
     ];
   }));
-  fill("route-signals", run.signals.map((signal, j) => [
+  // What the verdict reads stands among its terms.
+  fill("route-signals", run.signals.flatMap((signal, j) => signal.feature ? [] : [[
     cell(signal.name, told(signal), "text"), cell(number(value(j, i)) + unit(signal)),
     cell(level(signal)), cell(over(signal, i) ? "▲" : "", "above its own threshold", "text"),
-  ]));
+  ]]));
 };
 const fillCandidates = (i) => {
   const lines = [];
