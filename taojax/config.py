@@ -205,6 +205,9 @@ class Config(eqx.Module):
         _check_range("seed", self.seed, 0, 2**63)
 
 
+_GONE = {"joint_window", "joint_seeds", "memory_frames", "kappa_spacings"}
+"""Settings of the joint branches, which runs sealed by earlier builds hold."""
+
 _PARTS = {"stream": StreamConfig, "verdict": VerdictConfig, "audit": AuditConfig}
 """Tables of a settings file."""
 
@@ -272,7 +275,9 @@ def from_toml(path: Path) -> Config:
         defaults = {f.name: f.default for f in dataclasses.fields(cls)}
         unknown = sorted(set(value) - set(defaults))
         if unknown:
-            raise ConfigError(f"{path}: unknown key(s) in [{name}]: {', '.join(unknown)}")
+            gone = " of an earlier build: delete them, or score the data again"
+            hint = gone if set(unknown) <= _GONE else ""
+            raise ConfigError(f"{path}: unknown key(s) in [{name}]: {', '.join(unknown)}{hint}")
         try:
             parts[name] = cls(**{k: _typed(k, v, defaults[k]) for k, v in value.items()})
         except ConfigError as error:

@@ -66,3 +66,10 @@ def test_replace_finds_fields_wherever_they_live():
 def test_replace_refuses_unknown_names():
     with pytest.raises(ConfigError, match="wndow"):
         replace(Config(), {"wndow": 9})
+
+
+def test_settings_of_an_earlier_build_are_refused_with_what_to_do(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text("[stream]\njoint_window = 60\n")
+    with pytest.raises(ConfigError, match="joint_window of an earlier build: delete them, or"):
+        from_toml(path)
