@@ -4,7 +4,7 @@ Every frame gets the paper's literal cost over K branches; under joint associati
 `hindsight` answers beside it, and `tao` and the pose are its.
 
 tables = map_tables(poses)                      # once per map
-state = init(config)
+state = init(config, tables)
 state, record = step(config, tables, state, frame)    # per frame
 state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
 """
