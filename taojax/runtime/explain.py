@@ -22,6 +22,7 @@ from taojax.records import Run
 from taojax.runtime import hindsight
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.tables import MOTION, POSE, read_table, stacked
+from taojax.verdicts import SILENT
 
 TOLERANCE = 1e-4
 """A recomputed cost may differ from the sealed one by so much: the rounding of sums on another
@@ -198,7 +199,7 @@ def explain(folder: Path, run: Run, frame: int) -> Look:
     price, weight = np.asarray(paths.price, float), np.asarray(window.weight, float)
     share = weight / max(weight.sum(), 1e-9)
     cost = price @ share
-    has_answer = run.signals["status"][frame] not in ("warming_up", "no_candidates")
+    has_answer = run.signals["status"][frame] not in SILENT
     carried = np.asarray(transform(paths.pose[0][None], window.xy), float)
     there = run.index[frame] >= 0
     return Look(

@@ -213,6 +213,7 @@ def step(
     return eqx.tree_at(lambda s: s.filter, state, known), with_answer(record, answer)
 
 
+@jax.jit
 def with_answer(record: StreamRecord, answer: hindsight.Answer) -> StreamRecord:
     """Return records whose `tao` and pose are the filter's.
 

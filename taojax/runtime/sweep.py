@@ -232,10 +232,7 @@ def plan(
         log = rank_log(tables, frames, largest(mine, "window"), largest(mine, "branches"))
         # Refinement is another program: its units stay among themselves.
         for refine in (False, True):
-            alike = [
-                unit for unit in ranked if unit.rows and rows[unit.rows[0]]["refine"] == refine
-            ]
-            if alike:
+            if alike := [unit for unit in ranked if rows[unit.rows[0]]["refine"] == refine]:
                 work.append((partial(rank_signals, tables, log), alike))
     if joint := joint_units(rows, config.verdict):
         seen = hindsight.cleaned(tables, frames.odometry, frames.index, frames.similarity)
