@@ -233,7 +233,7 @@ def _verdicts(
         base = getattr(for_run(shipped(), audit.max_wrong, config.verdict.lag), kind)
         place = answer.pose[:, :2].astype(float)
         error = np.hypot(*(place - data.truth_m).T)
-        half = field.split({name: columns[name] for name in base.columns}).calibration
+        half = field.split({name: columns[name] for name in base.reads}).calibration
         own = risk.own_answers(error, field.nearest_m, audit.wrong_m, audit.r_out_m)
         cut = risk.Own(own.is_right[half.frame], own.is_wrong[half.frame])
         p = probability_wrong(risk.refine(base, half, cut, audit.max_wrong), columns)

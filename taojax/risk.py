@@ -22,6 +22,11 @@ from taojax.specs import column_names, read_text
 LARGEST_LOG_ODDS = 30.0
 """Keeps probabilities inside (0, 1) in float64."""
 
+DOUBT_COUNTS = 3.0
+"""How often the filter's doubt of a lone answer counts: about as often as the level of the pooled
+model exceeds the promised share, so that one is accepted where the filter doubts it by at most
+that share. At 1 twice as many answers that are accepted after a simulated kidnap are wrong."""
+
 SCHEMA = 3
 """Of calibration.toml; files of 0.1.0 have none."""
 
@@ -56,6 +61,14 @@ class Risk(NamedTuple):
 
     promise: str
     """What is promised, on what assumption, in words."""
+
+    alone: str = ""
+    """Column with the filter's doubt of answers that stand alone; causal answers have none."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Return every column that a probability needs."""
+        return (*self.columns, self.alone) if self.alone else self.columns
 
     @property
     def level(self) -> float:
@@ -123,10 +136,18 @@ def terms(risk: Risk, features: Mapping[str, np.ndarray]) -> Float[np.ndarray, "
 
 
 def probability_wrong(risk: Risk, features: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
-    """Return the probability that each answer is wrong."""
+    """Return the probability that each answer is wrong; of a lone one at least its own doubt."""
     # Summed by hand: a matrix product may round differently for other numbers of frames.
     odds = np.sum(terms(risk, features), axis=1) + risk.bias
-    return 1.0 / (1.0 + np.exp(-np.clip(odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
+    p = 1.0 / (1.0 + np.exp(-np.clip(odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
+    return np.maximum(p, lone_doubt(risk, features))
+
+
+def lone_doubt(risk: Risk, features: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
+    """Return the least probability of being wrong of answers that stand alone; 0 of others."""
+    if not risk.alone:
+        return np.zeros(len(features[risk.columns[0]]))
+    return np.minimum(1.0, DOUBT_COUNTS * np.asarray(features[risk.alone], float))
 
 
 def _quoted(text: str) -> str:
@@ -205,7 +226,10 @@ def _risk(tree: Mapping[str, Any], spec: str) -> Risk:
     is_level = np.isnan(levels) | ((levels >= 0.0) & (levels <= 1.0))
     if shares.ndim != 1 or shares.shape != levels.shape or not is_level.all() or not 0 < most < 1:
         raise ValueError("max_wrongs, levels and max_wrong do not fit")
-    return Risk(*model, shares, levels, most, str(tree["promise"]))
+    alone = str(tree.get("alone", ""))
+    if alone and alone not in column_names(spec):
+        raise ValueError(f"unknown column {alone!r}")
+    return Risk(*model, shares, levels, most, str(tree["promise"]), alone)
 
 
 def _parse(text: str, where: str) -> Calibration:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from taojax.detector import probability
-from taojax.risk import Calibration, Risk, probability_wrong, terms
+from taojax.risk import Calibration, Risk, lone_doubt, probability_wrong, terms
 
 STATUS_MEANS = {
     "ok": "",
@@ -40,9 +40,10 @@ def judged(
         status: of every frame, as in signals.csv.
     """
     p, parts = probability_wrong(risk, features), terms(risk, features)
+    is_alone = p == lone_doubt(risk, features)
     verdicts, reasons = [], []
     for t, said in enumerate(status):
-        name = risk.columns[int(np.argmax(parts[t]))]
+        name = risk.alone if is_alone[t] else risk.columns[int(np.argmax(parts[t]))]
         doubt = f"largest doubt: {name}"
         if said in SILENT:
             verdict, reason = "abstain", f"{said}: {STATUS_MEANS[said]}"

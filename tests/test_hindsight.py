@@ -88,7 +88,7 @@ def streamed(config, tables, parts):
 
 
 def assert_same(a, b, rows=slice(None)):
-    for name in ("pose", "map_index", "covariance", "features"):
+    for name in ("pose", "map_index", "covariance", "features", "alone"):
         np.testing.assert_array_equal(getattr(a, name)[rows], getattr(b, name)[rows], err_msg=name)
 
 

@@ -161,7 +161,10 @@ def test_a_whole_log_is_asked_as_its_pieces_are(rng):
     n = hindsight.CHUNK + 37
     poses = np.cumsum(rng.normal(0.5, 0.5, (n, 3)), axis=0).astype(np.float32)
     features = rng.normal(size=(n, len(hindsight.FEATURES))).astype(np.float32)
-    answers = hindsight.Answer(poses, np.zeros(n, np.int32), np.zeros((n, 3), np.float32), features)
+    nothing = np.zeros(n, np.float32)
+    answers = hindsight.Answer(
+        poses, np.zeros(n, np.int32), np.zeros((n, 3), np.float32), features, nothing
+    )
     odometry = rng.normal(0.3, 0.2, (n, 3)).astype(np.float32)
     numbers = first_look().final
     whole = hindsight.recall_log(CONFIG, numbers, 1.5, odometry, answers)

@@ -156,6 +156,37 @@ def test_windows_are_short_usual_and_long_to_the_past_alone(gap):
     np.testing.assert_allclose(got["rival"], np.log(0.3), rtol=1e-4)
 
 
+def test_an_answer_stands_alone_where_neither_its_list_nor_the_end_of_the_lag_names_it(gap):
+    rng = np.random.default_rng(5)
+    places = map_tables(PLACES).places
+    pose, window = made(rng, gap)
+    here = W // 2
+    reading = Reading(jnp.asarray(pose, jnp.float32), jnp.int32(20), jnp.float32(0.6),
+                      jnp.float32(0.1), jnp.float32(0.2), jnp.float32(0.3),
+                      jnp.ones(3))  # fmt: skip
+
+    def alone(*, elsewhere, own=hindsight.FARTHEST, there=W):
+        """Answers that agree but for some rows, in a log that ends after `there` rows."""
+        answers = np.c_[carried(pose, np.asarray(window.xy)), np.zeros(W)]
+        answers[list(elsewhere)] += 50.0
+        paces = jnp.asarray(np.arange(W) < there, jnp.float32)
+        return float(hindsight._alone(
+            CONFIG, places, reading, window, paces, jnp.int32(here),
+            jnp.asarray(answers, jnp.float32), jnp.float32(own),
+        ))  # fmt: skip
+
+    doubt = pytest.approx(0.4)
+    ends = range(W - hindsight.END_FRAMES, W)
+    assert alone(elsewhere=()) == 0.0
+    assert alone(elsewhere=ends) == doubt
+    assert alone(elsewhere=ends, own=9.9) == 0.0
+    assert alone(elsewhere=list(ends)[:2]) == 0.0
+    assert alone(elsewhere=list(ends)[:3]) == doubt
+    assert alone(elsewhere=range(ends[0])) == 0.0
+    assert alone(elsewhere=(), there=here + 1) == doubt
+    assert alone(elsewhere=range(W - 2, W), there=W - 2) == 0.0
+
+
 @pytest.mark.parametrize("share", [0.11, 0.37, 0.5, 1.0])
 def test_windows_reach_as_far_as_so_many_whole_frames_are_driven(share, gap):
     places = map_tables(PLACES).places

@@ -15,7 +15,7 @@ from taojax.config import AuditConfig
 from taojax.detector import Detector, MapFacts, foreign_map
 from taojax.errors import InputError
 from taojax.risk import Calibration, Risk, at_most, for_run, from_toml, shipped, to_toml
-from taojax.verdicts import decide
+from taojax.verdicts import decide, judged
 
 SEEN = MapFacts("ab12", "ef56", 2.0, 0.9)
 
@@ -148,6 +148,25 @@ def test_the_probability_is_the_logistic_of_the_terms_and_each_row_stands_alone(
     assert ((p > 0) & (p < 1)).all()
     part = risk.probability_wrong(FINAL, {name: values[7:9] for name, values in table.items()})
     np.testing.assert_array_equal(p[7:9], part)
+
+
+def test_a_lone_answer_is_as_doubtful_as_three_times_what_the_filter_says(tmp_path):
+    table = {"place": np.full(4, -9.0), "cost": np.zeros(4), "alone": [0.0, 0.01, 0.2, 0.5]}
+    lone = FINAL._replace(alone="alone")
+    plain = risk.probability_wrong(FINAL, table)
+    want = np.maximum(plain, [0.0, 0.03, 0.6, 1.0])
+    np.testing.assert_allclose(risk.probability_wrong(lone, table), want)
+    assert lone.reads == ("place", "cost", "alone")
+    assert FINAL.reads == ("place", "cost")
+    _, reasons, _ = judged(lone._replace(levels=np.full(3, 0.001)), table, np.full(4, "ok"))
+    assert reasons[2].endswith("largest doubt: alone")
+    path = tmp_path / "calibration.toml"
+    path.write_text(to_toml(WHOLE._replace(final=lone)))
+    assert from_toml(path).final.alone == "alone"
+    assert from_toml(path).now.alone == ""
+    path.write_text(path.read_text().replace('alone = "alone"', 'alone = "loud"'))
+    with pytest.raises(InputError, match="unknown column 'loud'"):
+        from_toml(path)
 
 
 @pytest.mark.parametrize(

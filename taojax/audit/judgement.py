@@ -122,7 +122,7 @@ def judge(
     # One splitter makes both halves, of the features of the answers as of the signals.
     base = for_run(shipped(), audit.max_wrong, config.verdict.lag)
     features = {name: run.signals[name] for name in base.now.columns}
-    features |= {name: run.delayed[name] for name in base.final.columns + base.map_out.columns}
+    features |= {name: run.delayed[name] for name in base.final.reads + base.map_out.columns}
     first = labels.split_frames(
         signals | features, label, calibration_share=share, gap_frames=gap
     ).calibration
@@ -160,7 +160,7 @@ def judge(
         config=config,
         manifest=run.manifest,
         signals=run.signals,
-        delayed={name: run.delayed[name] for name in base.final.columns},
+        delayed={name: run.delayed[name] for name in base.final.reads},
         map_m=map_m,
         query_m=truth.xy_m,
         nearest_m=nearest,

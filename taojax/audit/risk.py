@@ -101,7 +101,7 @@ def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> R
     for part in np.array_split(known, FOLDS):
         others = np.setdiff1d(known, part)
         if part.size and others.size:
-            there = {name: split.signals[name][part] for name in base.columns}
+            there = {name: split.signals[name][part] for name in base.reads}
             apart = _moved(base, z[others], own.is_wrong[others])
             unseen[part] = probability_wrong(apart, there)
     levels = np.array([

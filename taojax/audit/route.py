@@ -95,7 +95,7 @@ def _signals(judgement: Judgement) -> list[dict[str, Any]]:
             "threshold": None,
             "feature": True,
         }
-        for name in judgement.calibration.final.columns
+        for name in judgement.calibration.final.reads
     ]
 
 

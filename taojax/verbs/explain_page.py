@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taojax.risk import terms
+from taojax.risk import lone_doubt, terms
 from taojax.verdicts import SILENT, STATUS_MEANS
 
 if TYPE_CHECKING:
@@ -111,10 +111,14 @@ def _decided(look: "Look", run: "Run", verdicts: "Verdicts | None") -> str:
         for name, term in list(found.items())[:MOST_TERMS]
     ]
     rest = sum(list(found.values())[MOST_TERMS:])
-    return (
+    said = (
         f"{', '.join(told)}, {len(found) - MOST_TERMS} more {rest:+.2f}: log odds of being wrong "
         f"above the mean of the pooled recordings, which itself has {risk.bias:+.2f}"
     )
+    least = lone_doubt(risk, {name: run.delayed[name] for name in risk.reads})[look.frame]
+    if least:
+        said += f"; it stands alone, so wrong with probability {least:.3f} at least"
+    return said
 
 
 def _terms(risk: "Risk", look: "Look", run: "Run") -> dict[str, float]:
