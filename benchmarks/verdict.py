@@ -36,11 +36,11 @@ RIDGE = 3.0
 
 POOLED_WEIGHT = 1000.0
 
-LEVEL_OVER_SHARE = {"now": 2.4, "final": 2.7}
+LEVEL_OVER_SHARE = 2.4
 """Level of the probability over the promised share. The pooled model is unsure of what it has not
-seen: final answers of left-out recordings keep the promise from 2.4 times the share (.75 of the
-right ones accepted, .017 wrong) to 3.0 times, and most are accepted at 2.7 (.76, .017); above, more
-recordings fail closed. Causal ones break it at 3.0 times .05: .064 wrong, .032 at 2.4."""
+seen: at 1.6 times .05 the shipped numbers accept .70 of the right answers of left-out recordings
+with .035 wrong, at 2.4 times .05 .73 with .035; at 3.0 times causal ones break the promise (.064).
+Refined final ones could go to 4.0 times: .77 with .018, where 2.4 gives .75 with .017."""
 
 HALF_TRUSTED = 0.12
 """Probability of being wrong at which an answer counts half as a witness for those after it."""
@@ -205,7 +205,7 @@ def pooled(
     )
     shares = np.array(MAX_WRONGS)
     # What is more likely wrong than right is never accepted.
-    levels = np.minimum(0.5, LEVEL_OVER_SHARE[kind] * shares)
+    levels = np.minimum(0.5, LEVEL_OVER_SHARE * shares)
     alone = "alone" if kind == "final" else ""
     return Risk(names, mean, scale, q[:-1], float(q[-1]), shares, levels, 0.05, promise, alone)
 
