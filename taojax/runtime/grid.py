@@ -153,7 +153,7 @@ def pin(grid: Grid, fixed: Mapping[str, float | int | None], association: str | 
     return kept
 
 
-def to_toml(grid: Grid) -> str:
+def grid_to_toml(grid: Grid) -> str:
     """Return a grid as TOML that `read_grid` reads back unchanged."""
     lines = []
     for association, values in grid.items():

@@ -23,7 +23,7 @@ def top1(similarity: Float[Array, " k"]) -> Float[Array, ""]:
     return 1.0 - similarity[0]
 
 
-def windowed(history: Float[Array, " w"], n_seen: Int[Array, ""]) -> Float[Array, " l"]:
+def windowed_means(history: Float[Array, " w"], n_seen: Int[Array, ""]) -> Float[Array, " l"]:
     """Return the means of a signal over its last frames, one per length in `WINDOWS`.
 
     Args:

@@ -279,7 +279,7 @@ def _literal(
     history = push(state.top1, signals.top1(similarity))
     previous = state.q[-1, :, 0]
     had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
-    means = signals.windowed(history, n_seen)
+    means = signals.windowed_means(history, n_seen)
     windowed = {f"top1_w{n}": mean for n, mean in zip(signals.WINDOWS, means, strict=True)}
     values = {
         "top1": signals.top1(similarity),

@@ -52,7 +52,7 @@ def check_same(out: Path, config: Config, grid: grids.Grid) -> None:
         InputError: another grid or configuration, or a broken seal.
     """
     hashes = read_manifest(out)["sha256"]
-    now = {"config.toml": to_toml(config), "grid.toml": grids.to_toml(grid)}
+    now = {"config.toml": to_toml(config), "grid.toml": grids.grid_to_toml(grid)}
     _refuse_others(out, [n for n, text in now.items() if hashes.get(n) != digest(text.encode())])
 
 
@@ -135,7 +135,7 @@ def sweep(
     )
     files: dict[str, bytes] = {
         "config.toml": to_toml(config).encode(),
-        "grid.toml": grids.to_toml(grid).encode(),
+        "grid.toml": grids.grid_to_toml(grid).encode(),
         "grid.csv": table_text("grid", grids.as_table(rows)).encode(),
         "map_poses.csv": table_text("map_poses", observations.map_poses).encode(),
     }

@@ -100,7 +100,7 @@ def _compute_apart(
 ) -> None:
     """Compute in a fresh interpreter: one in which the judge has never been imported."""
     from taojax.config import to_toml
-    from taojax.runtime.grid import to_toml as grid_toml
+    from taojax.runtime.grid import grid_to_toml as grid_toml
 
     with tempfile.TemporaryDirectory() as scratch:
         settings, values = Path(scratch) / "config.toml", Path(scratch) / "grid.toml"
