@@ -17,9 +17,8 @@ from taojax.config import Config
 from taojax.risk import for_run, probability_wrong, shipped
 from taojax.runtime import hindsight
 from taojax.runtime.frames import Frame, StreamRecord
-from taojax.runtime.maps import MapTables, map_tables
+from taojax.runtime.maps import LEAST_RANGE, MapTables, map_tables
 from taojax.runtime.rivals import SYSTEMS
-from taojax.runtime.scale import LEAST_RANGE
 from taojax.runtime.score import replay_log
 from taojax.runtime.stream import answered
 

@@ -16,8 +16,7 @@ from taojax.audit.evaluate import evaluate
 from taojax.audit.graph import ORACLE, TITLES, write_graph
 from taojax.config import AuditConfig, Config
 from taojax.datasets.edit import scenario
-from taojax.datasets.simulate import WorldConfig, make_world
-from taojax.datasets.world import write_world
+from taojax.datasets.simulate import WorldConfig, make_world, write_world
 from taojax.graph.optimise import check_extra
 from taojax.plots import CYCLE, PALE
 from taojax.records import read_run

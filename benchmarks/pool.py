@@ -27,7 +27,7 @@ from benchmarks.sets import (
     real,
 )
 from taojax.datasets.edit import delete_map_segments, kept_by_segments
-from taojax.datasets.kidnap_folder import read_poses
+from taojax.datasets.kidnap import read_poses
 from taojax.datasets.progress import ProgressConfig, along, retained
 from taojax.datasets.simulate import (
     WorldConfig,

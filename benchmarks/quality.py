@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from benchmarks.entrants import FITTED, GATES, ORACLES, Entry, Field, compete
 from benchmarks.pictures import save
 from benchmarks.sets import DataSet, Recipe, recipes
-from taojax.audit import bootstrap, calibration, metrics, risk, tables
+from taojax.audit import calibration, metrics, risk, tables
+from taojax.audit import metrics as bootstrap
 from taojax.audit.labels import CalibrationSplit
 from taojax.config import AuditConfig, Config
 

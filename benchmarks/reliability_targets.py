@@ -130,7 +130,7 @@ def _settings(folder: Path) -> None:
 def _read_settings(folder: Path, out: Path) -> list[np.ndarray]:
     from taojax.config import from_toml
     from taojax.risk import from_toml as calibration_of
-    from taojax.runtime.grid import expand, read_grid
+    from taojax.runtime.sweep import expand, read_grid
 
     config = from_toml(folder / "config.toml")
     rows = expand(read_grid(folder / "grid.toml"), config)

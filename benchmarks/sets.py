@@ -11,7 +11,7 @@ import numpy as np
 from taojax.audit.truth import read_truth
 from taojax.datasets.edit import SCENARIO_SEGMENTS_M as SEGMENTS_M
 from taojax.datasets.edit import kept_by_segments, scenario
-from taojax.datasets.kidnap_folder import read_poses
+from taojax.datasets.kidnap import read_poses
 from taojax.datasets.simulate import (
     WorldConfig,
     describe_routes,

@@ -23,10 +23,9 @@ from taojax.config import Config, VerdictConfig
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world
 from taojax.runtime.frames import Frame
-from taojax.runtime.grid import DEFAULT, Grid, Row, expand
 from taojax.runtime.maps import map_tables
 from taojax.runtime.retrieval import retrieve
-from taojax.runtime.sweep import at_once, evaluate, plan
+from taojax.runtime.sweep import DEFAULT, Grid, Row, at_once, evaluate, expand, plan
 
 BATCHES = (1, 4, 16)
 """Units under one vmap; 1 is the loop."""

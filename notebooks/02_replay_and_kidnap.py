@@ -24,8 +24,7 @@ import numpy as np
 
 from taojax import STATUSES, Config, Frame, map_tables, replay
 from taojax.audit.recovery import frames_to_recovery
-from taojax.datasets.kidnap import Plan, make_logs
-from taojax.datasets.kidnap_folder import world_source
+from taojax.datasets.kidnap import Plan, make_logs, world_source
 from taojax.datasets.simulate import WorldConfig
 from taojax.runtime.retrieval import retrieve
 

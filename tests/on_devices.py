@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from taojax.config import Config, StreamConfig
-from taojax.runtime import retrieval, trials
+from taojax.runtime import retrieval
+from taojax.runtime import score as trials
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 

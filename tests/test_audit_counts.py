@@ -6,8 +6,8 @@ import judged
 import numpy as np
 import pytest
 
-from taojax.audit import counts
-from taojax.audit.words import find_words, metric_row
+from taojax.audit import summary_text as counts
+from taojax.audit.summary_text import find_words, metric_row
 from taojax.tables import read_table
 
 

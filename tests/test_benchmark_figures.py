@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks import ablation, concepts, gallery, pictures, sets, speed
 from benchmarks.ablation import Cell
-from taojax.datasets.world import WorldConfig
+from taojax.datasets.simulate import WorldConfig
 from taojax.errors import InputError
 from taojax.runtime.bench import Row
 

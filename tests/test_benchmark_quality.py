@@ -10,7 +10,7 @@ import pytest
 from benchmarks import __main__, quality, sets
 from benchmarks.entrants import ORACLES, oracle_levels
 from taojax.config import AuditConfig, Config, StreamConfig
-from taojax.datasets.world import WorldConfig
+from taojax.datasets.simulate import WorldConfig
 
 ENTRANTS = ("tao", "topological", "top1", *ORACLES)
 TINY = WorldConfig(n_map=220, n_query=160, dimension=32, offset_m=4.0, odometry_scale=0.0)

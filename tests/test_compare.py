@@ -11,7 +11,9 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from taojax import records
-from taojax.audit import bootstrap, compare, compare_report, figures, report, tables
+from taojax.audit import compare, figures, report, tables
+from taojax.audit import compare as compare_report
+from taojax.audit import metrics as bootstrap
 from taojax.audit.evaluate import evaluate
 from taojax.cli import main
 from taojax.config import replace

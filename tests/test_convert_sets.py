@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from taojax.cli import main
-from taojax.datasets.kri import read_kri
-from taojax.datasets.mulran import read_complex_urban, read_mulran
-from taojax.datasets.robotcar import read_robotcar
-from taojax.datasets.vivid import read_vivid
+from taojax.datasets.public_sets import (
+    read_complex_urban,
+    read_kri,
+    read_mulran,
+    read_robotcar,
+    read_vivid,
+)
 from taojax.errors import InputError
 from taojax.runtime.observations import load_observations
 from taojax.tables import read_table

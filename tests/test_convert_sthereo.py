@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from taojax.cli import main
+from taojax.datasets.public_sets import check_sensors, read_frame_list, read_sthereo
 from taojax.datasets.sessions import Matching
-from taojax.datasets.sthereo import check_sensors, read_frame_list, read_sthereo
 from taojax.errors import InputError
 from taojax.runtime.observations import load_observations
 from taojax.tables import read_table

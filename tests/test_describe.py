@@ -11,7 +11,7 @@ from street import model  # noqa: E402
 
 from taojax.cli import main  # noqa: E402
 from taojax.datasets import describe as described  # noqa: E402
-from taojax.datasets.images import Preparation, eight_bit, list_images, read_image  # noqa: E402
+from taojax.datasets.describe import Preparation, eight_bit, list_images, read_image  # noqa: E402
 from taojax.errors import InputError  # noqa: E402
 
 N = 24

@@ -12,7 +12,7 @@ import pytest
 
 from taojax.datasets.descriptors import read_views
 from taojax.datasets.folder import Descriptors, Session, write_folder
-from taojax.datasets.frame_names import Names
+from taojax.datasets.lists import Names
 from taojax.datasets.trajectory import Trajectory
 from taojax.errors import InputError
 from taojax.runtime.observations import load_observations

@@ -6,8 +6,7 @@ import pytest
 from conftest import loop, motions
 
 from taojax.config import VerdictConfig
-from taojax.datasets.simulate import make_world
-from taojax.datasets.world import WorldConfig
+from taojax.datasets.simulate import WorldConfig, make_world
 from taojax.risk import shipped
 from taojax.runtime import hindsight
 from taojax.runtime.maps import map_tables

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import loop, motions, table
 
-from taojax.audit.recovery_data import LEAST_FRAMES
+from taojax.audit.recovery import LEAST_FRAMES
 from taojax.cli import main
 from taojax.datasets.kidnap import (
     LEVELS,
@@ -22,13 +22,15 @@ from taojax.datasets.kidnap import (
     Source,
     cut_rows,
     far_m,
+    folder_source,
     in_map,
     make_logs,
     noisy_odometry,
+    world_source,
+    write_logs,
 )
-from taojax.datasets.kidnap_folder import folder_source, world_source, write_logs
+from taojax.datasets.simulate import WorldConfig
 from taojax.datasets.trajectory import motions as true_motions
-from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError
 from taojax.runtime.observations import load_observations
 from taojax.tables import read_table

@@ -13,8 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 from taojax.datasets.odometry import odometry_at, simulated
 from taojax.datasets.odometry import read_odometry as read_drive
 from taojax.datasets.reading import Reading
+from taojax.datasets.simulate import WorldConfig
 from taojax.datasets.trajectory import Trajectory, integrate, motions
-from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError, MissingExtraError
 
 N = 60

@@ -10,8 +10,8 @@ from taojax import cli
 from taojax.audit import figures, opening
 from taojax.audit.evaluate import evaluate
 from taojax.audit.judgement import Evaluation
-from taojax.audit.opening_map import KINDS, draw_opening, kinds_of
-from taojax.audit.words import find_words, summary_words, terminal_words
+from taojax.audit.opening import KINDS, draw_opening, kinds_of
+from taojax.audit.summary_text import find_words, summary_words, terminal_words
 from taojax.tables import read_table
 
 

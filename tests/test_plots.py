@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from taojax import plots
-from taojax.window_plot import AXES_POINTS, LETTER, LINE, place_labels
+from taojax.plots import AXES_POINTS, LETTER, LINE, place_labels
 
 
 @pytest.fixture

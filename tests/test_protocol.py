@@ -6,10 +6,9 @@ import pytest
 
 from taojax.audit import calibration, figures, protocol
 from taojax.audit.evaluate import evaluate
-from taojax.audit.glossary import about
+from taojax.audit.html import about
 from taojax.audit.report import write_summary
-from taojax.audit.summary import PAPER_TABLE_2, mapout_table
-from taojax.audit.words import metric_row
+from taojax.audit.summary_text import PAPER_TABLE_2, mapout_table, metric_row
 from taojax.detector import probability
 from taojax.tables import read_table
 

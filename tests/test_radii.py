@@ -7,8 +7,8 @@ import pytest
 from conftest import loop, motions
 
 from taojax.runtime import inspection
-from taojax.runtime.radii import suggest_radii
-from taojax.verbs.inspect_truth import drift_m
+from taojax.runtime.inspection import suggest_radii
+from taojax.verbs.inspect_page import drift_m
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ from taojax.records import read_run
 from taojax.runtime.explain import explain
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
-from taojax.runtime.refined import check_refinement
-from taojax.runtime.score import score
+from taojax.runtime.score import check_refinement, score
 from taojax.runtime.stream import cost_params, replay
 
 SMALL = StreamConfig(window=8, branches=6, association="rank", refine=True)

@@ -12,10 +12,9 @@ import pytest
 from taojax import records
 from taojax.audit import figures, route
 from taojax.audit.evaluate import evaluate
-from taojax.audit.glossary import glossary, marked, names_of_signals
+from taojax.audit.html import Page, glossary, marked, names_of_signals, render
 from taojax.audit.opening import TOO_SHORT, UNKNOWN, sentence
-from taojax.audit.page import Page, render
-from taojax.audit.words import NO_SHIELD, find_words, span, warnings
+from taojax.audit.summary_text import NO_SHIELD, find_words, span, warnings
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import judged
 import pytest
 
 from taojax.audit import figures
-from taojax.audit.glossary import names_of_signals
+from taojax.audit.html import names_of_signals
 from taojax.audit.report import write_summary
 
 BROWSER = next(

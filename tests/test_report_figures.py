@@ -9,11 +9,13 @@ import pandas as pd
 import pytest
 
 from taojax import records
-from taojax.audit import figures, scenario_figures, summary
+from taojax.audit import figures
+from taojax.audit import figures as scenario_figures
+from taojax.audit import summary_text as summary
+from taojax.audit.evaluate import paste_files
 from taojax.audit.judgement import Evaluation, judge
-from taojax.audit.paste import paste_files
+from taojax.audit.summary_text import MAIN, metric_row
 from taojax.audit.truth import read_truth
-from taojax.audit.words import MAIN, metric_row
 
 
 def judgement_of(folder, **changes):

@@ -15,8 +15,7 @@ from taojax.errors import InputError
 from taojax.runtime import rivals
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
-from taojax.runtime.score import replay_log, score
-from taojax.runtime.trials import in_trials, replay_trials
+from taojax.runtime.score import in_trials, replay_log, replay_trials, score
 
 SMALL = Config(stream=StreamConfig(window=6, branches=5))
 RANK = replace(SMALL, {"association": "rank"})
@@ -59,7 +58,7 @@ def test_more_trials_than_one_chunk(trials, monkeypatch):
     tables, frames = trials
     cut = in_trials(frames, LENGTH)
     whole = replay_trials(RANK, tables, cut)
-    monkeypatch.setattr("taojax.runtime.trials.CHUNK_TRIALS", 2)
+    monkeypatch.setattr("taojax.runtime.score.CHUNK_TRIALS", 2)
     chunked = replay_trials(RANK, tables, cut)
     np.testing.assert_array_equal(whole.status, chunked.status)
     np.testing.assert_allclose(whole.pose, chunked.pose, atol=1e-5)

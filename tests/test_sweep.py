@@ -10,7 +10,7 @@ from taojax.audit.labels import TestSplit as HeldOut
 from taojax.audit.labels import split_frames
 from taojax.config import Config, StreamConfig, replace
 from taojax.errors import ConfigError
-from taojax.runtime import grid as grids
+from taojax.runtime import sweep as grids
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.stream import replay

@@ -13,7 +13,7 @@ from conftest import table, write_folder
 
 from taojax.cli import main
 from taojax.errors import InputError
-from taojax.runtime import sweep_run
+from taojax.runtime import sweep as sweep_run
 
 SMALL_GRID = """
 association = ["rank"]

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from taojax import plots
 from taojax.audit import figures, labels, tables
 from taojax.audit.figures import Picture, csv_text, picture
+from taojax.audit.html import Page, grid, render
 from taojax.audit.own_map import nearest_known
-from taojax.audit.page import Page, grid, render
 from taojax.audit.truth import Truth, read_truth
 from taojax.closures import Verdicts, compose
 from taojax.config import AuditConfig

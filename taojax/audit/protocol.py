@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from taojax.audit import bootstrap, calibration, metrics
+from taojax.audit import calibration, metrics
+from taojax.audit import metrics as bootstrap
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.labels import TestSplit
-from taojax.audit.summary import PAPER_TABLE_2, WHOLE, cut_maps
+from taojax.audit.summary_text import PAPER_TABLE_2, WHOLE, cut_maps, metric_row
 from taojax.audit.tables import FUSED, NAN, PROBABILITIES, Table, from_rows, operating_row
-from taojax.audit.words import metric_row
 from taojax.detector import Detector, probability
 
 COMPARED = ("top1", "velocity", "tao_rank", "tao", *PROBABILITIES)

@@ -7,16 +7,34 @@ from pathlib import Path
 
 import numpy as np
 
-from taojax.audit import figures, protocol, scenario_figures, summary, tables
-from taojax.audit.counts import VERDICT_FAR, counts_table, rates_of, rates_table
+from taojax.audit import figures, protocol, tables
+from taojax.audit import figures as scenario_figures
+from taojax.audit import summary_text as summary
 from taojax.audit.figures import Picture
-from taojax.audit.glossary import glossary, names_of_signals, names_of_tables
+from taojax.audit.html import (
+    Grid,
+    Opening,
+    Page,
+    glossary,
+    grid,
+    names_of_signals,
+    names_of_tables,
+    render,
+)
 from taojax.audit.judgement import Evaluation, Judgement
-from taojax.audit.opening import numbers, sentence, summary_sentence
-from taojax.audit.opening_map import draw_opening
-from taojax.audit.page import Grid, Opening, Page, grid, render
+from taojax.audit.opening import draw_opening, numbers, sentence, summary_sentence
 from taojax.audit.route import route_json
-from taojax.audit.words import MAIN, alarms, all_alarms, metric_row, rate
+from taojax.audit.summary_text import (
+    MAIN,
+    VERDICT_FAR,
+    alarms,
+    all_alarms,
+    counts_table,
+    metric_row,
+    rate,
+    rates_of,
+    rates_table,
+)
 from taojax.specs import read_npz, write_atomically
 
 _ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")

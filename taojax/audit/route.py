@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.audit.glossary import names_of_signals
+from taojax.audit.html import names_of_signals
 from taojax.audit.judgement import Judgement
 from taojax.audit.risk import FINAL, NOW
 from taojax.audit.tables import FUSED

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.audit import bootstrap, calibration, labels, metrics, tables
+from taojax.audit import calibration, labels, metrics, tables
+from taojax.audit import metrics as bootstrap
 from taojax.audit.figures import as_files
 from taojax.audit.sweep_figures import NO_SETTING, draw, varied
 from taojax.audit.truth import read_truth

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from taojax.audit import bootstrap, calibration, metrics, risk
+from taojax.audit import calibration, metrics, risk
+from taojax.audit import metrics as bootstrap
 from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.config import AuditConfig

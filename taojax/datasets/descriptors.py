@@ -27,9 +27,7 @@ from taojax.datasets.arrays import (
     two_axes,
 )  # fmt: skip
 from taojax.datasets.folder import Descriptors, Lists, Session
-from taojax.datasets.frame_names import Names
-from taojax.datasets.hloc import H5_SUFFIXES, open_features
-from taojax.datasets.lists import has_scores, read_lists
+from taojax.datasets.lists import H5_SUFFIXES, Names, has_scores, open_features, read_lists
 from taojax.specs import fail
 
 __all__ = ["goes_by_name", "read_side", "read_views", "view_notes"]

@@ -15,10 +15,9 @@ from jaxtyping import Float
 
 from taojax.datasets.arrays import check_begin
 from taojax.datasets.clocks import in_order, seconds
-from taojax.datasets.named_columns import Column
 from taojax.datasets.odometry import OdometryKind, read_odometry
 from taojax.datasets.reading import PLAIN, Drive, Plane, Reading
-from taojax.datasets.text_rows import COMMENTS, TextRows, read_rows
+from taojax.datasets.text_tables import COMMENTS, Column, TextRows, read_rows
 from taojax.datasets.trajectories import (
     DERIVED,
     NUMBERED,

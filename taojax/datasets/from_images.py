@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from taojax.datasets.clocks import PER_S
 from taojax.datasets.convert import Motion
+from taojax.datasets.describe import list_images, names_below
 from taojax.datasets.files import read_motion, read_poses
 from taojax.datasets.folder import Session
-from taojax.datasets.images import list_images, names_below
 from taojax.datasets.plain import session_of
 from taojax.datasets.reading import Drive, Reading
 from taojax.datasets.sessions import Matching, matched_session

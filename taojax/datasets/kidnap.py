@@ -1,4 +1,4 @@
-"""Splices kidnap logs: the robot is carried elsewhere, and its odometry does not notice.
+"""Splices kidnap logs, in memory and on disk: the robot is carried elsewhere, its odometry unaware.
 
 A log is a row of stretches, each a run of consecutive frames that really followed one another in
 the source. Logs for thresholds and logs whose kidnaps count are spliced from other frames. Into
@@ -6,37 +6,62 @@ the first frame of a stretch leads the motion that belonged to that frame: the r
 it drove on. Views are those of the source; odometry is the true motion plus simulated drift.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from taojax.about import read_about
+from taojax.datasets.folder import stamped_text
+from taojax.datasets.simulate import NOTE, WorldConfig, make_world, seen_places
 from taojax.datasets.trajectory import motions
 from taojax.errors import InputError
+from taojax.specs import read_npy, read_npz, write_atomically
+from taojax.tables import MOTION, POSE, read_table, stacked, table_text
 
 __all__ = [
-    "LEVELS", "Drift", "Log", "Plan", "Source", "cut_rows", "in_map", "make_logs",
-    "noisy_odometry", "splice",
-]  # fmt: skip
+    "LEVELS",
+    "Drift",
+    "Log",
+    "Plan",
+    "Source",
+    "cut_rows",
+    "folder_source",
+    "in_map",
+    "make_logs",
+    "noisy_odometry",
+    "read_poses",
+    "splice",
+    "world_source",
+    "write_logs",
+]
 
 TRIAL_FRAMES = 160
+
 """Frames of a log."""
 
 WINDOW_FRAMES = 20
+
 """Frames over which the end drift of a level is stated; a jump nearer to the end is no trial."""
 
 FAR_M = 100.0
+
 """A kidnap carries the robot at least so far, metres, or ..."""
 
 FAR_SHARE = 0.25
+
 """... this share of the map's longer side, if that is less."""
 
 CALIBRATION_EVERY = 5
+
 """Every so many logs one is set apart for thresholds; its kidnaps are not counted."""
 
 PARTS = (10, 8, 6, 4)
+
 """The in-map frames are cut into so many equal runs, and calibration logs are spliced from two of
 them, half of a drive apart; fewer and longer ones where the first number leaves a side without a
 stretch that is long enough and far enough away."""
@@ -57,6 +82,7 @@ LEVELS: Mapping[str, Drift] = {
     "medium": Drift(0.07, 7.5),
     "high": Drift(0.18, 31.0),
 }
+
 """Placed about what real recordings show over 20 frames: mit_corridor 1.0 % and 0.5 degrees,
 tuc_corridor 6.9 % and 7.5 degrees, intel_lab 18.4 % and 31 degrees."""
 
@@ -303,3 +329,133 @@ def make_logs(
         n_counted += logs[-1].n_counted
         number += 1
     return logs
+
+
+def world_source(config: WorldConfig, seed: int) -> Source:
+    """Simulate a world to splice from, with the place whose appearance each frame saw."""
+    world = make_world(config, seed)
+    return Source(
+        map_poses=world.map_poses,
+        query_poses=world.query_poses,
+        seen_m=seen_places(config, seed),
+        map_views=world.map_descriptors,
+        query_views=(world.query_descriptors,),
+        notes=(NOTE,),
+    )
+
+
+def read_poses(path: Path, spec: str) -> np.ndarray:
+    """Read a table as pose rows (t [s], x [m], y [m], theta [rad]).
+
+    Args:
+        path: the table.
+        spec: its spec in data_specs/.
+
+    Raises:
+        InputError: the table is missing or malformed.
+    """
+    return stacked(read_table(path, spec), ("t_s", *POSE))
+
+
+def folder_source(folder: Path) -> Source:
+    """Read a data folder with truth to splice from.
+
+    Args:
+        folder: laid out as data_specs/README.md says; its odometry is not used.
+
+    Raises:
+        InputError: a file is missing or malformed, or views and poses differ in number.
+    """
+    map_poses = read_poses(folder / "map/poses.csv", "map_poses")
+    query_poses = read_poses(folder / "truth/query_poses.csv", "query_poses")
+    lists = folder / "query/retrievals.npz"
+    map_views = None
+    if lists.exists():
+        arrays = read_npz(lists, "retrievals")
+        path, views = lists, (arrays["index"], arrays["similarity"])
+    else:
+        path = folder / "query/descriptors.npy"
+        views = (read_npy(path, "descriptors"),)
+        map_views = read_npy(folder / "map/descriptors.npy", "descriptors")
+    if len(views[0]) != len(query_poses):
+        raise InputError(
+            f"{path}: {len(views[0])} rows, but {folder / 'truth/query_poses.csv'} has"
+            f" {len(query_poses)}; both must describe the same frames"
+        )
+    return Source(map_poses, query_poses, None, map_views, views, read_about(folder).notes)
+
+
+def _said(source: Source, logs: Sequence[Log]) -> list[str]:
+    """Return what the report must repeat."""
+    n = sum(len(log.kidnaps) for log in logs)
+    levels = dict.fromkeys(log.drift for log in logs)
+    drift = ", ".join(
+        f"{name} {100 * LEVELS[name].share:g} % and {LEVELS[name].yaw_deg:g} degrees"
+        for name in levels
+    )
+    return [
+        *source.notes,
+        f"spliced: {len(logs)} logs of {TRIAL_FRAMES} frames with {n} simulated kidnaps; views are"
+        " those of the source",
+        f"simulated odometry: true motion plus drift; over {WINDOW_FRAMES} frames {drift}",
+    ]
+
+
+def write_logs(source: Source, logs: Sequence[Log], folder: Path) -> None:
+    """Write logs one after another as a data folder with its truth.
+
+    Args:
+        source: that the logs were spliced from.
+        logs: from `make_logs`.
+        folder: where to; made where absent.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    rows = np.concatenate([log.rows for log in logs])
+    dt_s = float(np.median(np.diff(source.query_poses[:, 0])))
+    stamps = np.arange(len(rows)) * (dt_s if dt_s > 0 else 1.0)
+    odometry = np.concatenate([log.odometry for log in logs])
+    truth = source.query_poses[rows]
+    files = {
+        "map/poses.csv": stamped_text(
+            "map_poses", POSE, source.map_poses[:, 0], source.map_poses[:, 1:]
+        ),
+        "query/odometry.csv": stamped_text("query_odometry", MOTION, stamps, odometry),
+        "truth/query_poses.csv": stamped_text("query_poses", POSE, stamps, truth[:, 1:]),
+        "truth/kidnaps.csv": table_text("kidnaps", _kidnaps(logs)),
+        "truth/logs.csv": table_text("logs", _log_table(logs)),
+        "about.toml": f"trial_frames = {TRIAL_FRAMES}\n"
+        + f"notes = {json.dumps(_said(source, logs), ensure_ascii=False)}\n",
+    }
+    if source.seen_m is not None:
+        seen = np.concatenate([source.seen_m[rows], truth[:, 3:]], axis=1)
+        files["truth/seen_poses.csv"] = stamped_text("query_poses", POSE, stamps, seen)
+    for name, text in files.items():
+        write_atomically(folder / name, text)
+    if source.map_views is None:
+        index, similarity = (part[rows] for part in source.query_views)
+        np.savez_compressed(folder / "query/retrievals.npz", index=index, similarity=similarity)
+    else:
+        # Half precision halves the folder and moves a cosine by less than a thousandth.
+        np.save(folder / "map/descriptors.npy", np.asarray(source.map_views))
+        views = np.asarray(source.query_views[0])
+        np.save(folder / "query/descriptors.npy", views[rows].astype(np.float16))
+
+
+def _kidnaps(logs: Sequence[Log]) -> dict[str, np.ndarray]:
+    counts = [len(log.kidnaps) for log in logs]
+    return {
+        "log": np.repeat(np.arange(len(logs)), counts),
+        "frame": np.concatenate([log.kidnaps for log in logs]),
+        "step_m": np.concatenate([log.step_m for log in logs]),
+    }
+
+
+def _log_table(logs: Sequence[Log]) -> dict[str, np.ndarray]:
+    return {
+        "log": np.arange(len(logs)),
+        "drift": np.array([log.drift for log in logs], dtype=object),
+        "stretch_frames": np.array([log.stretch for log in logs]),
+        "split": np.array([log.split for log in logs], dtype=object),
+    }

@@ -1,40 +1,196 @@
-"""Retrieval lists and similarity matrices of a user's own frontend, for the frames that stay.
+"""Retrieval lists, similarity matrices and hloc files of a user's own frontend, frames by name."""
 
-    npz         index (T, K), similarity (T, K); -1 = no candidate
-    csv, txt    one row per query and candidate: `query,map,similarity` with a header, or hloc's
-                pairs `query map [score]`; names, or in a csv numbers of frames
-    npy         dense similarities (queries x map)
-
-Lists speak of the whole map: candidates that do not stay are dropped, the others renumbered.
-"""
-
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.datasets.arrays import (
+from taojax.datasets.arrays import (  # fmt: skip
     blocks,
     check_begin,
     check_kind,
     map_archive,
     map_npy,
     two_axes,
-)  # fmt: skip
+)
 from taojax.datasets.folder import Lists, Session
-from taojax.datasets.frame_names import Names
-from taojax.specs import fail, read_text
+from taojax.errors import InputError
+from taojax.specs import fail, load_spec, read_text
 from taojax.tables import read_table
 
-__all__ = ["N_BEST", "has_scores", "read_lists"]
+__all__ = [
+    "H5_SUFFIXES",
+    "N_BEST",
+    "Features",
+    "Names",
+    "has_scores",
+    "open_features",
+    "read_lists",
+]
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    return tuple(part for part in name.replace("\\", "/").split("/") if part not in ("", "."))
+
+
+class Names:
+    """Names of images, and which of them another program's name means."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = [_parts(name) for name in names]
+        self._whole: dict[tuple[str, ...], list[int]] = defaultdict(list)
+        self._base: dict[str, list[int]] = defaultdict(list)
+        for at, name in enumerate(self._names):
+            self._whole[name].append(at)
+            self._base[name[-1] if name else ""].append(at)
+
+    def find(self, name: str) -> list[int]:
+        """Return where a name lies among these.
+
+        Args:
+            name: a path, relative to anything.
+
+        Returns:
+            Positions: none for an unknown name, several where it could mean several.
+        """
+        wanted = _parts(name)
+        if wanted in self._whole:
+            return self._whole[wanted]
+        same_base = self._base.get(wanted[-1] if wanted else "", [])
+        if len(same_base) < 2:
+            return same_base
+        ends = [at for at in same_base if _ends_alike(self._names[at], wanted)]
+        return ends or same_base
+
+
+def _ends_alike(a: tuple[str, ...], b: tuple[str, ...]) -> bool:
+    """Tell whether the shorter path is the end of the longer one."""
+    n = min(len(a), len(b))
+    return a[-n:] == b[-n:]
+
+
+H5_SUFFIXES = (".h5", ".hdf5")
+
+DATASET = "global_descriptor"
+
+
+CACHE_BYTES = 2 << 20
+
+"""HDF5 would otherwise keep 10 kB of every group it has seen."""
+
+
+class Features:
+    """Descriptors of some frames in an open file."""
+
+    def __init__(self, path: Path, file: h5py.File, frames: Sequence[str]) -> None:
+        cache = file.id.get_mdc_config()
+        cache.set_initial_size = True
+        cache.initial_size = cache.min_size = cache.max_size = CACHE_BYTES
+        file.id.set_mdc_config(cache)
+        self._path, self._file = path, file
+        self._groups = _groups(path, file, frames)
+        first = self._dataset(0)
+        self._shape = first.shape
+        self.dimension = int(np.prod(first.shape))
+        self.dtype = np.dtype(first.dtype)
+        squeezed = f"{path.name}: shape {first.shape} is read as ({self.dimension},)"
+        self.notes = () if len(first.shape) == 1 else (squeezed,)
+
+    def _dataset(self, row: int) -> Any:
+        # The low level is four times as fast, which counts for a hundred thousand images.
+        group = self._groups[row]
+        try:
+            found = h5py.h5d.open(self._file.id, f"{group}/{DATASET}".encode())
+        except (KeyError, TypeError) as error:
+            what = f"group {group} lacks {DATASET}"
+            raise fail(self._path, what, "extract it again with hloc") from error
+        spec = load_spec("hloc")["dataset"]
+        # One row or column of numbers is a descriptor too.
+        n_long = sum(n != 1 for n in found.shape)
+        if found.rank < 1 or n_long > spec["ndim"] or found.dtype.kind not in spec["kinds"]:
+            what = f"{group}/{DATASET} has shape {found.shape} and dtype {found.dtype}"
+            raise fail(self._path, what, f"expected {spec['shape']}")
+        return found
+
+    def read(self, rows: np.ndarray) -> np.ndarray:
+        """Return (k, D) descriptors of frames, by their place in the list asked for.
+
+        Raises:
+            InputError: a descriptor is missing, damaged or of another length or kind.
+        """
+        block = np.empty((len(rows), self.dimension), self.dtype)
+        for at, row in enumerate(rows):
+            found = self._dataset(int(row))
+            if found.shape != self._shape or found.dtype != self.dtype:
+                what = (
+                    f"{self._groups[int(row)]} has {np.prod(found.shape)} numbers of {found.dtype},"
+                    f" but {self._groups[0]} has {self.dimension} of {self.dtype}"
+                )
+                raise fail(self._path, what, "use one network for all images")
+            found.read(h5py.h5s.ALL, h5py.h5s.ALL, block[at].reshape(self._shape))
+        return block
+
+
+@contextmanager
+def open_features(path: Path, frames: Sequence[str]) -> Iterator[Features]:
+    """Open an hloc file and find the groups of some frames.
+
+    Args:
+        path: the .h5.
+        frames: names of the images wanted; a group's name is the whole name or, where that is
+            unique, ends alike.
+
+    Raises:
+        InputError: damaged file, or a frame without group or with several.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            yield Features(path, file, frames)
+    except InputError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        what = f"is not a readable HDF5 file ({str(error).splitlines()[0][:80]})"
+        raise fail(path, what, "extract the features again with hloc") from error
+
+
+def _groups(path: Path, file: h5py.File, frames: Sequence[str]) -> list[str]:
+    """Return the group of every frame."""
+    groups = [name.strip("/") for name in frames]
+    if all(name and name in file for name in groups):
+        return groups
+    seen: list[str] = []
+    file.visit(seen.append)
+    held = [name.removesuffix(f"/{DATASET}") for name in seen if name.endswith(f"/{DATASET}")]
+    if not held:
+        raise fail(path, f"no group holds {DATASET}", "point at hloc's global features")
+    names = Names(held)
+    return [_group(path, held, names.find(frame), frame) for frame in frames]
+
+
+def _group(path: Path, held: Sequence[str], found: Sequence[int], frame: str) -> str:
+    if len(found) == 1:
+        return held[found[0]]
+    if not found:
+        raise fail(path, f"no descriptor of the frame {frame}", "extract all images of the session")
+    what = f"frame {frame} could be {held[found[0]]} or {held[found[1]]}"
+    raise fail(path, what, "keep the two sessions in two files")
+
 
 N_BEST = 100
+
 """Candidates kept of a dense row, the paper's K."""
 
 LARGEST = 1.0 + 1e-3
+
 """Rounding may lift a cosine so far."""
 
 FIX_SCALE = "similarities are at most 1: store cosines (1 - d^2 / 2 of unit descriptors) or rescale"
+
 FIX_ORDER = "store the best candidate first; larger = more alike, so turn distances round"
 
 

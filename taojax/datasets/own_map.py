@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from taojax.about import DESCRIPTORS, read_about
 from taojax.datasets.folder import Descriptors, Lists, write_folder
-from taojax.datasets.simulate import simulated_odometry
+from taojax.datasets.simulate import WorldConfig, simulated_odometry
 from taojax.datasets.trajectory import Trajectory, integrate
-from taojax.datasets.world import WorldConfig
 from taojax.errors import InputError
 from taojax.specs import read_npy, read_npz
 from taojax.tables import MOTION, POSE, read_table, stacked

@@ -16,22 +16,32 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from taojax.datasets.clocks import FASTEST_S, in_order, seconds
-from taojax.datasets.facing import decided, misfit_rad
-from taojax.datasets.named_columns import COMPASS, Column, find_columns, numbers, values_of
 from taojax.datasets.reading import PLAIN, Drive, Plane, Quaternion, Reading
-from taojax.datasets.text_rows import NAMES, TextRows, read_rows
-from taojax.datasets.trajectory import Trajectory, headings, motions
+from taojax.datasets.text_tables import (
+    COMPASS,
+    NAMES,
+    Column,
+    TextRows,
+    find_columns,
+    numbers,
+    read_rows,
+    values_of,
+)
+from taojax.datasets.trajectory import Trajectory, driven_m, headings, motions, spaced
 from taojax.errors import InputError
 from taojax.specs import fail, load_spec, read_text
 from taojax.tables import is_number
 
 __all__ = [
+    "CLEAR_RAD",
     "DERIVED",
     "NUMBERED",
     "Kind",
+    "decided",
     "flat_poses",
     "headings_of",
     "looks_like",
+    "misfit_rad",
     "ordered_quaternions",
     "read_stamps",
     "read_trajectory",
@@ -40,41 +50,104 @@ __all__ = [
     "stamps_s",
     "text_columns",
     "with_times",
-]  # fmt: skip
+]
+
+CLEAR_RAD = np.deg2rad(2.0)
+
+"""A reading that is nearer than this to the direction of motion is not questioned."""
+
+LEAST_CHORDS = 4
+
+"""So many pieces of way are needed to say anything."""
+
+
+def misfit_rad(xy: Float[np.ndarray, "n 2"], theta: Float[np.ndarray, " n"]) -> float | None:
+    """Return how far headings are from the direction of motion, forwards or in reverse.
+
+    Args:
+        xy: (n, 2) positions [m] in the order driven.
+        theta: (n,) headings [rad].
+
+    Returns:
+        Root of the mean square [rad] over pieces of a metre, at most pi / 2; shorter pieces where
+        the whole way is short. None where the body hardly moves.
+    """
+    way = float(driven_m(xy)[-1])
+    piece = min(1.0, way / 20.0)
+    if piece < 0.02:
+        return None
+    at = spaced(xy, piece)
+    if len(at) <= LEAST_CHORDS:
+        return None
+    step = np.diff(xy[at], axis=0)
+    middle = np.angle(np.exp(1j * theta[at[:-1]]) + np.exp(1j * theta[at[1:]]))
+    off = np.arctan2(step[:, 1], step[:, 0]) - middle
+    off = np.abs((off + np.pi / 2) % np.pi - np.pi / 2)
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def decided(misfits: Mapping[str, float | None]) -> str | None:
+    """Return the reading that the direction of motion leaves, None where it says nothing.
+
+    Args:
+        misfits: reading -> what `misfit_rad` says of it.
+    """
+    known = sorted((value, name) for name, value in misfits.items() if value is not None)
+    if len(known) < len(misfits) or len(known) < 2:
+        return None
+    (best, name), (second, _) = known[:2]
+    is_clear = second > CLEAR_RAD and best < 0.5 * second and best < np.deg2rad(20.0)
+    return name if is_clear else None
+
 
 Kind = Literal["tum", "kitti", "euroc", "g2o", "csv"]
+
 """Who wrote the file."""
 
 Where = Callable[[int], str]
+
 """Names the row, message or line that pose i comes from."""
 
 DERIVED = "headings are derived from positions"
+
 NUMBERED = "no time stamps: row numbers stand for seconds"
 
 UNIT_LENGTH = 0.01
+
 """How far a quaternion may be from unit length, and a rotation matrix from orthonormal."""
 
 UPRIGHT = 0.1
+
 """A forward axis with less than this in the plane stands upright on it and has no heading."""
 
 LARGEST = 1e7
+
 """No coordinate is larger, UTM northings in metres included."""
 
 APART_M = 1.0
+
 """Poses nearer to each other than this say nothing about where forward is."""
 
 FITS_RAD = math.radians(20.0)
+
 """Headings this near to the direction of motion are headings."""
 
 SIDEWAYS_RAD = math.radians(30.0)
+
 """Headings farther than this from the direction of motion are worth a line."""
 
 _Fine = Literal["microseconds", "nanoseconds"]
+
 _UNITS = ("seconds", "milliseconds", "microseconds", "nanoseconds")
+
 _VERTICES = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
+
 _Q = ("qx", "qy", "qz", "qw")
+
 _R = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
+
 _OURS = ("t_s", "x_m", "y_m", "theta_rad")
+
 KNOWN = "x,y,theta, t,x,y,z,qx,qy,qz,qw or dx,dy,dtheta"
 
 

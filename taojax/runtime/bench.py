@@ -25,8 +25,7 @@ from taojax.baselines.topometric import topometric
 from taojax.config import StreamConfig
 from taojax.core.cost import Branch, CostParams, branch_cost
 from taojax.errors import GateError, InputError
-from taojax.runtime.bench_fresh import first_steps, imports, installed
-from taojax.runtime.bench_rows import Row, best_us, peak_mb
+from taojax.runtime.bench_fresh import Row, best_us, first_steps, imports, installed, peak_mb
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.retrieval import normalise, prepare, top_k

@@ -1,15 +1,47 @@
-"""What a robot pays once: imports and first step in fresh interpreters, and room on its disk."""
+"""Timings that need an interpreter of their own, and the rows that timings are written in."""
 
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
+
+import jax
 
 from taojax import specs
-from taojax.runtime.bench_rows import Row
+
+
+class Row(NamedTuple):
+    """One figure of bench.csv."""
+
+    name: str
+    value: float
+    unit: str
+
+
+def best_us(work: Callable[[], object], repeats: int, per: int = 1) -> float:
+    """Return the microseconds of the fastest repeat, divided by `per`; the first call is free."""
+    jax.block_until_ready(work())
+    best = float("inf")
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(work())
+        best = min(best, time.perf_counter() - began)
+    return best / per * 1e6
+
+
+def peak_mb() -> float:
+    """Return the most memory that this process ever held."""
+    # Kilobytes on Linux, bytes on macOS.
+    unit = 1.0 if sys.platform == "darwin" else 1e3
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
 
 FIRST_STEP = """
 import time, numpy as np, jax, jax.numpy as jnp
@@ -35,6 +67,7 @@ print(time.perf_counter() - began)
 """
 
 N_IMPORTS = 3
+
 """The fastest counts: the first one also writes bytecode and fills the cache of the disk."""
 
 

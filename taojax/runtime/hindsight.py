@@ -40,8 +40,7 @@ from taojax.core.path import Support, Window, support
 from taojax.core.se2 import between, compose, inverse, transform
 from taojax.detector import Detector
 from taojax.risk import first_look
-from taojax.runtime.maps import MapTables
-from taojax.runtime.scale import rescale
+from taojax.runtime.maps import MapTables, rescale
 
 LISTED = 15
 """Candidates per frame that a path may run through."""

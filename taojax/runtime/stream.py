@@ -1,12 +1,6 @@
-"""Causal replay: one frame in, one record out, constant memory.
+"""Causal replay: one frame in, one record with every signal out, constant memory.
 
-Every frame gets the paper's literal cost over K branches; under joint association the filter of
-`hindsight` answers beside it, and `tao` and the pose are its.
-
-tables = map_tables(poses)                      # once per map
-state = init(config, tables)
-state, record = step(config, tables, state, frame)    # per frame
-state, records = replay(config, tables, frames)       # a whole log, one `lax.scan`
+Larger signals mean more likely off the map.
 """
 
 import dataclasses
@@ -20,11 +14,11 @@ from jaxtyping import Array, Bool, Float, Int
 from taojax.config import Config, StreamConfig
 from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
 from taojax.core.history import push
-from taojax.core.procrustes import diagnose
+from taojax.core.procrustes import diagnose, weighted_mean
 from taojax.core.se2 import inverse, transform
 from taojax.core.sums import least, over_frames
 from taojax.errors import InputError
-from taojax.runtime import hindsight, signals
+from taojax.runtime import hindsight
 from taojax.runtime.frames import (
     DEGENERATE,
     NO_CANDIDATES,
@@ -37,10 +31,95 @@ from taojax.runtime.frames import (
 )
 from taojax.runtime.maps import MapTables
 
+WINDOWS = (5, 10, 20)
+
+"""Lengths of the windowed top-1 signals, frames."""
+
+SUE_CANDIDATES = 10
+
+SUE_SHARPNESS = 20.0
+
+"""Weights of the spatial spread: softmax(20 s) over the top 10."""
+
+
+def top1(similarity: Float[Array, " k"]) -> Float[Array, ""]:
+    """Return 1 - similarity of the best candidate; 1 without one."""
+    return 1.0 - similarity[0]
+
+
+def windowed_means(history: Float[Array, " w"], n_seen: Int[Array, ""]) -> Float[Array, " l"]:
+    """Return the means of a signal over its last frames, one per length in `WINDOWS`.
+
+    Args:
+        history: oldest first, newest last.
+        n_seen: how many entries are filled, from the end.
+    """
+    age = jnp.arange(history.shape[0])[::-1, None]
+    lengths = jnp.minimum(jnp.asarray(WINDOWS), n_seen)
+    is_in = (age < lengths[None]).astype(history.dtype)
+    return over_frames(is_in * history[:, None]) / jnp.maximum(lengths.astype(history.dtype), 1.0)
+
+
+def margin(similarity: Float[Array, " k"]) -> Float[Array, ""]:
+    """Return -(s_1 - s_2); a missing second candidate counts as similarity 0."""
+    second = similarity[1] if similarity.shape[0] > 1 else jnp.zeros_like(similarity[0])
+    return -(similarity[0] - second)
+
+
+def entropy(
+    similarity: Float[Array, " k"],
+    is_there: Bool[Array, " k"],
+    temperature: float | Float[Array, ""],
+) -> Float[Array, ""]:
+    """Return the entropy of the softmax of the similarities [nat]; log K without candidates."""
+    logits = (similarity - similarity[0]) / temperature
+    weight = jnp.where(is_there, jnp.exp(logits), 0.0)
+    # -sum p log p with p = w / total, where log w is the logit.
+    total, energy = over_frames(jnp.stack([weight, weight * jnp.where(is_there, logits, 0.0)], 1))
+    safe = jnp.where(total > 0, total, 1.0)
+    nats = jnp.maximum(jnp.log(safe) - energy / safe, 0.0)
+    return jnp.where(total > 0, nats, jnp.log(float(similarity.shape[0])))
+
+
+def velocity(
+    position: Float[Array, "2"],
+    previous: Float[Array, "2"],
+    has_both: Bool[Array, ""],
+    odometry: Float[Array, "3"],
+) -> Float[Array, ""]:
+    """Return the absolute difference between the top-1 step and the odometry step [m].
+
+    0 while there is no pair of top-1 positions to compare.
+    """
+    retrieved = jnp.hypot(position[0] - previous[0], position[1] - previous[1])
+    driven = jnp.hypot(odometry[0], odometry[1])
+    return jnp.where(has_both, jnp.abs(retrieved - driven), 0.0)
+
+
+def sue(
+    positions: Float[Array, "k 2"], similarity: Float[Array, " k"], is_there: Bool[Array, " k"]
+) -> Float[Array, ""]:
+    """Return the weighted variance of the top-10 positions, x and y summed [m^2].
+
+    Source:
+        Spatial uncertainty estimation, CVPR 2024; constants of data_specs/signals.toml.
+    """
+    n = min(SUE_CANDIDATES, similarity.shape[0])
+    logits = SUE_SHARPNESS * (similarity[:n] - similarity[0])
+    weight = jnp.where(is_there[:n], jnp.exp(logits), 0.0)
+    # Relative to the best candidate, so that far-off map coordinates cost no digits.
+    offset = positions[:n] - positions[:1]
+    mean = weighted_mean(offset, weight)
+    across, up = weighted_mean((offset - mean[None]) ** 2, weight)
+    return across + up
+
+
 WARM_FRAMES = 3
+
 """Frames seen before anything is said of a place."""
 
 COMPILING = "compiling once"
+
 """On a bar until the first frames are done, some 5 to 20 s: one that stands still alarms."""
 
 
@@ -125,7 +204,7 @@ def init(config: Config | StreamConfig, tables: MapTables) -> StreamState:
         has_anchor=jnp.zeros((n, k), bool),
         is_filled=jnp.zeros(n, bool),
         weight=jnp.zeros(n),
-        top1=jnp.zeros(max(signals.WINDOWS)),
+        top1=jnp.zeros(max(WINDOWS)),
         n_seen=jnp.zeros((), jnp.int32),
         filter=hindsight.init(config.verdict, tables) if is_joint else None,
     )
@@ -275,25 +354,23 @@ def _literal(
     rank = least(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
     shape = diagnose(p, q[:, :, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
 
-    n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *signals.WINDOWS))
-    history = push(state.top1, signals.top1(similarity))
+    n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *WINDOWS))
+    history = push(state.top1, top1(similarity))
     previous = state.q[-1, :, 0]
     had_previous = state.has_anchor[-1, 0] & state.is_filled[-1]
-    means = signals.windowed_means(history, n_seen)
-    windowed = {f"top1_w{n}": mean for n, mean in zip(signals.WINDOWS, means, strict=True)}
+    means = windowed_means(history, n_seen)
+    windowed = {f"top1_w{n}": mean for n, mean in zip(WINDOWS, means, strict=True)}
     values = {
-        "top1": signals.top1(similarity),
+        "top1": top1(similarity),
         **windowed,
-        "margin": signals.margin(similarity),
-        "entropy": signals.entropy(similarity, is_there, config.entropy_temperature),
+        "margin": margin(similarity),
+        "entropy": entropy(similarity, is_there, config.entropy_temperature),
         "velocity": jnp.where(
             has_candidates,
-            signals.velocity(anchors[0], previous, had_previous & is_there[0], odometry),
+            velocity(anchors[0], previous, had_previous & is_there[0], odometry),
             tables.extent_m,
         ),
-        "sue": jnp.where(
-            has_candidates, signals.sue(anchors, similarity, is_there), tables.extent_m**2
-        ),
+        "sue": jnp.where(has_candidates, sue(anchors, similarity, is_there), tables.extent_m**2),
         # Candidates off the map scatter over it and span an area that no driven window does.
         "c_geom": shape.c_geom,
         "a_aniso": 0.0 - shape.a_aniso,

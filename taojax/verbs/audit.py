@@ -123,7 +123,7 @@ def _audit_folder(dataset: Path, out: Path, config: "Config", *, progress: bool)
 
 def _audit_images(args: Audit, out: Path, config: "Config") -> None:
     """Describe and convert beside the run, score, and judge where the truth is known."""
-    from taojax.datasets.additions import TRUTH
+    from taojax.datasets.edit import TRUTH
     from taojax.records import refuse_if_taken
     from taojax.specs import write_atomically
 
@@ -173,7 +173,7 @@ def _audit_converted(args: Audit, out: Path, config: "Config") -> None:
 
 def _judge(dataset: Path, out: Path, config: "Config") -> None:
     from taojax.audit.evaluate import evaluate
-    from taojax.audit.words import terminal_words
+    from taojax.audit.summary_text import terminal_words
 
     say("judging: labels, calibration, intervals from resampled blocks, figures")
     evaluation = evaluate(out, dataset / "truth", config)
@@ -189,8 +189,7 @@ def _judge(dataset: Path, out: Path, config: "Config") -> None:
 
 def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress: bool) -> None:
     from taojax.datasets.edit import scenario
-    from taojax.datasets.simulate import WorldConfig, make_world
-    from taojax.datasets.world import write_world
+    from taojax.datasets.simulate import WorldConfig, make_world, write_world
 
     say("simulating the KAIST-like world")
     world = make_world(WorldConfig(), config.seed)
@@ -204,7 +203,7 @@ def _audit_world(only: Scenario | None, out: Path, config: "Config", *, progress
         score_apart([Scoring(folder, out / name)], config, progress=progress)
     from taojax.audit.evaluate import evaluate
     from taojax.audit.report import write_summary
-    from taojax.audit.words import summary_words
+    from taojax.audit.summary_text import summary_words
 
     for name in (only,) if only else SCENARIOS:
         say(f"judging scenario {name} (simulated)")

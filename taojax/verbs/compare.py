@@ -37,8 +37,7 @@ def run(args: Compare) -> None:
     if len(args.runs) < 2:
         raise UsageError("compare needs at least two runs")
     check_seed(args.seed)
-    from taojax.audit.compare import compare
-    from taojax.audit.compare_report import sentences, write
+    from taojax.audit.compare import compare, sentences, write
     from taojax.records import refuse_if_taken
 
     if args.out is not None:

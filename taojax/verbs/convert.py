@@ -90,7 +90,7 @@ def make(data: Data) -> None:
 
 def _add(data: Files) -> None:
     """Make a folder of a map alone, or add a query or the truth to one that is there."""
-    from taojax.datasets import additions
+    from taojax.datasets import edit as additions
     from taojax.datasets.plain import read_session
 
     reading = reading_of(data, is_motion=False)
@@ -279,7 +279,7 @@ def _matching(data: Data) -> "Matching":
 
 
 def _sthereo(data: Sthereo, matching: "Matching") -> "Sessions":
-    from taojax.datasets.sthereo import check_sensors, read_sthereo
+    from taojax.datasets.public_sets import check_sensors, read_sthereo
 
     is_local = data.poses == "local"
     mapped, query = (
@@ -294,7 +294,7 @@ def _sthereo(data: Sthereo, matching: "Matching") -> "Sessions":
 
 def _kri(data: Kri, matching: "Matching") -> "Sessions":
     from taojax.datasets.convert import N_MAP
-    from taojax.datasets.kri import read_kri
+    from taojax.datasets.public_sets import read_kri
 
     read = partial(read_kri, camera=data.camera, variant=data.variant, route_m=data.route_m)
     # The unit is a row of the map that is made, not of the sequence it is thinned from.
@@ -303,28 +303,28 @@ def _kri(data: Kri, matching: "Matching") -> "Sessions":
 
 
 def _mulran(data: Mulran, matching: "Matching") -> "Sessions":
-    from taojax.datasets.mulran import read_mulran
+    from taojax.datasets.public_sets import read_mulran
 
     read = partial(read_mulran, frames=data.frames, matching=matching)
     return read(data.map), read(data.query)
 
 
 def _complex_urban(data: ComplexUrban, matching: "Matching") -> "Sessions":
-    from taojax.datasets.mulran import read_complex_urban
+    from taojax.datasets.public_sets import read_complex_urban
 
     read = partial(read_complex_urban, frames=data.frames, matching=matching)
     return read(data.map), read(data.query)
 
 
 def _robotcar(data: Robotcar, matching: "Matching") -> "Sessions":
-    from taojax.datasets.robotcar import read_robotcar
+    from taojax.datasets.public_sets import read_robotcar
 
     read = partial(read_robotcar, camera=data.camera, gps=data.gps, matching=matching)
     return read(data.map), read(data.query)
 
 
 def _vivid(data: Vivid, matching: "Matching") -> "Sessions":
-    from taojax.datasets.vivid import read_vivid
+    from taojax.datasets.public_sets import read_vivid
 
     read = partial(read_vivid, images=data.frames, matching=matching)
     return read(data.map), read(data.query)

@@ -10,8 +10,7 @@ from taojax.errors import UsageError
 from taojax.verbs.common import flag, say
 
 if TYPE_CHECKING:
-    from taojax.datasets.describe import Described, Network
-    from taojax.datasets.images import Preparation
+    from taojax.datasets.describe import Described, Network, Preparation
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,8 +71,7 @@ def how_of(flags: Describing) -> "tuple[Preparation, Network | None]":
     told = {name: value for name, value in told.items() if value is not None}
     if told and flags.model is None:
         raise UsageError(f"--{next(iter(told))} goes with --model")
-    from taojax.datasets.describe import Network
-    from taojax.datasets.images import Preparation
+    from taojax.datasets.describe import Network, Preparation
 
     network = None if flags.model is None else Network(flags.model, **told)
     return Preparation(low, high, flags.clahe), network

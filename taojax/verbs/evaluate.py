@@ -26,7 +26,7 @@ class Evaluate(Common):
 def run(args: Evaluate) -> None:
     """Judge a sealed run."""
     from taojax.audit.evaluate import evaluate
-    from taojax.audit.words import terminal_words
+    from taojax.audit.summary_text import terminal_words
     from taojax.records import read_manifest
 
     read_manifest(args.run)

@@ -73,9 +73,9 @@ def _draw(stem: Path, sealed: "Run", look: "Look", headline: str) -> None:
     from matplotlib.figure import Figure
 
     from taojax.audit.figures import picture
+    from taojax.plots import WindowMarks, draw_window
     from taojax.specs import write_atomically
     from taojax.tables import table_text
-    from taojax.window_plot import WindowMarks, draw_window
 
     map_m = np.stack([sealed.map_poses[c] for c in ("x_m", "y_m")], axis=1)
     window, found = look.window, look.hypotheses

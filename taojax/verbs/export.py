@@ -51,8 +51,7 @@ def run(args: Export) -> None:
 
 def _world(folder: Path, seed: int) -> Path:
     from taojax.datasets.edit import scenario
-    from taojax.datasets.simulate import WorldConfig, make_world
-    from taojax.datasets.world import write_world
+    from taojax.datasets.simulate import WorldConfig, make_world, write_world
 
     say("simulating the KAIST-like world")
     write_world(scenario(make_world(WorldConfig(), seed), "default"), folder)

@@ -97,8 +97,8 @@ def make(flags: FromImages, folder: Path, *, progress: bool) -> Made:
         path = getattr(flags, name)
         if path is not None and not path.exists():
             raise InputError(f"{path}: no such file or folder ({_flag(name)}); name another one")
-    from taojax.datasets.additions import truth_text
     from taojax.datasets.convert import Choices, make_folder
+    from taojax.datasets.edit import truth_text
     from taojax.datasets.from_images import images_of, key_of, map_session, query_session
     from taojax.datasets.sessions import Matching
 

@@ -13,7 +13,7 @@ from taojax.verbs.layout import TRUTH, advice, check_folder, missing
 
 if TYPE_CHECKING:
     from taojax.audit.truth import Truth
-    from taojax.runtime.checkup import Found
+    from taojax.runtime.inspection import Found
 
 LEAST_MATCHED = 0.5
 """Share of query stamps that the truth has to know."""
@@ -43,10 +43,9 @@ def run(args: Inspect) -> None:
     """Print what was found; refuse a folder that cannot be scored or judged."""
     check_seed(args.seed)
     check_folder(args.dataset)
-    from taojax.runtime.checkup import check
-    from taojax.runtime.radii import suggest_radii
+    from taojax.runtime.inspection import check, suggest_radii
     from taojax.verbs import inspect_page as tell
-    from taojax.verbs.inspect_views import lengths, likeness
+    from taojax.verbs.inspect_page import lengths, likeness
 
     found = check(args.dataset)
     truth = _read_truth(args.dataset, found)

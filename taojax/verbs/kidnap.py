@@ -22,7 +22,7 @@ from taojax.verbs.common import (
 from taojax.verbs.resume import claimed
 
 if TYPE_CHECKING:
-    from taojax.audit.recovery_data import Part
+    from taojax.audit.recovery import Part
     from taojax.config import Config
     from taojax.datasets.kidnap import Plan, Source
 
@@ -114,8 +114,7 @@ def _splice(
     source: "Source", plans: "Sequence[Plan]", seed: int, folder: Path, rival_trials: int
 ) -> int:
     """Write the logs of some plans; return how many first logs hold the rivals' trials."""
-    from taojax.datasets.kidnap import LEVELS, make_logs
-    from taojax.datasets.kidnap_folder import write_logs
+    from taojax.datasets.kidnap import LEVELS, make_logs, write_logs
 
     logs = [
         log for at, plan in enumerate(plans) for log in make_logs(source, plan, seed + 1000 * at)
@@ -130,9 +129,8 @@ def _splice(
 
 def _simulated(args: Kidnap, config: "Config", out: Path) -> list[_Job]:
     """Make the folders of the simulated worlds."""
-    from taojax.datasets.kidnap import Plan
-    from taojax.datasets.kidnap_folder import world_source
-    from taojax.datasets.world import WorldConfig
+    from taojax.datasets.kidnap import Plan, world_source
+    from taojax.datasets.simulate import WorldConfig
 
     r_in, seeds = config.audit.r_in_m, range(config.seed, config.seed + args.worlds)
     jobs = []
@@ -160,8 +158,7 @@ def _simulated(args: Kidnap, config: "Config", out: Path) -> list[_Job]:
 
 def _recorded(args: Kidnap, config: "Config", out: Path) -> list[_Job]:
     """Make the folders of a recording."""
-    from taojax.datasets.kidnap import Plan, far_m
-    from taojax.datasets.kidnap_folder import folder_source
+    from taojax.datasets.kidnap import Plan, far_m, folder_source
 
     dataset = args.dataset or Path()
     if not dataset.is_dir():
@@ -195,6 +192,6 @@ def _score_all(
             yield Scoring(job.data, out / job.name, [] if job.kind == "stress" else flags)
 
     score_apart(wanted(), config, progress=progress, most=WORKERS)
-    from taojax.audit.recovery_data import Part
+    from taojax.audit.recovery import Part
 
     return [Part(job.kind, job.name, out / job.name, job.data / "truth") for job in jobs]

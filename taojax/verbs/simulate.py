@@ -30,8 +30,7 @@ def run(args: Simulate) -> None:
     """Write the world."""
     check_seed(args.seed)
     from taojax.datasets.edit import scenario
-    from taojax.datasets.simulate import WorldConfig, make_world
-    from taojax.datasets.world import write_world
+    from taojax.datasets.simulate import WorldConfig, make_world, write_world
 
     write_world(scenario(make_world(WorldConfig(), args.seed), args.scenario), args.folder)
     say(f"simulated world (scenario {args.scenario}, seed {args.seed}) in {args.folder}")

@@ -13,7 +13,7 @@ from taojax.verbs.common import Common, config_of, flag, out_of, run_apart, say
 
 if TYPE_CHECKING:
     from taojax.config import Config
-    from taojax.runtime.grid import Grid
+    from taojax.runtime.sweep import Grid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Sweep(Common):
 
 def run(args: Sweep) -> None:
     """Sweep a data folder or the simulated world."""
-    from taojax.runtime import grid as grids
-    from taojax.runtime.sweep_run import check_same, stage
+    from taojax.runtime import sweep as grids
+    from taojax.runtime.sweep import check_same, stage
 
     config = config_of(args)
     grid = grids.DEFAULT if args.grid is None else grids.read_grid(args.grid)
@@ -74,9 +74,8 @@ def run(args: Sweep) -> None:
 def _world(out: Path, seed: int) -> Path:
     """Write the simulated world into the sweep's folder, once."""
     from taojax.datasets.edit import scenario
-    from taojax.datasets.simulate import WorldConfig, make_world
-    from taojax.datasets.world import write_world
-    from taojax.runtime.sweep_run import PARTS
+    from taojax.datasets.simulate import WorldConfig, make_world, write_world
+    from taojax.runtime.sweep import PARTS
 
     folder = out / "data" / "default"
     if not (folder / "about.toml").is_file():  # written last
@@ -88,7 +87,7 @@ def _world(out: Path, seed: int) -> Path:
 
 
 def _compute(dataset: Path, out: Path, config: "Config", grid: "Grid", *, progress: bool) -> None:
-    from taojax.runtime.sweep_run import sweep
+    from taojax.runtime.sweep import sweep
 
     manifest = sweep(dataset, out, config, grid, progress=progress)
     n, seal = manifest["n_configurations"], manifest["seal"][:12]
@@ -100,7 +99,7 @@ def _compute_apart(
 ) -> None:
     """Compute in a fresh interpreter: one in which the judge has never been imported."""
     from taojax.config import to_toml
-    from taojax.runtime.grid import grid_to_toml as grid_toml
+    from taojax.runtime.sweep import grid_to_toml as grid_toml
 
     with tempfile.TemporaryDirectory() as scratch:
         settings, values = Path(scratch) / "config.toml", Path(scratch) / "grid.toml"
