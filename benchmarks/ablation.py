@@ -19,10 +19,10 @@ from benchmarks.sets import DataSet, recipes
 from taojax.audit import metrics, risk
 from taojax.audit.figures import csv_text
 from taojax.config import AuditConfig, Config, VerdictConfig
+from taojax.files.specs import write_atomically
 from taojax.plots import IN_MAP, MAP_OUT, PALE
 from taojax.risk import probability_wrong, shipped
 from taojax.runtime import hindsight
-from taojax.specs import write_atomically
 
 NAN = float("nan")
 

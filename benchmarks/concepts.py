@@ -11,8 +11,8 @@ from matplotlib.patches import Circle
 from taojax import risk
 from taojax.core.procrustes import fit_se2
 from taojax.core.se2 import transform
+from taojax.files.tables import read_table
 from taojax.plots import IN_MAP, INK, MAP_OUT, PALE
-from taojax.tables import read_table
 
 SIDES = (("in_map", "truly on the map", IN_MAP), ("map_out", "truly off the map", MAP_OUT))
 STEP_M = 5.0

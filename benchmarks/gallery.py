@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from benchmarks import concepts
 from taojax.cli import main
 from taojax.errors import InputError
-from taojax.specs import read_bytes, write_atomically
+from taojax.files.specs import read_bytes, write_atomically
 
 PICTURES = Path(__file__).parents[1] / ".github" / "pictures"
 

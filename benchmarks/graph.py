@@ -17,12 +17,12 @@ from taojax.audit.graph import ORACLE, TITLES, write_graph
 from taojax.config import AuditConfig, Config
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world, write_world
+from taojax.files.records import read_run
+from taojax.files.specs import column_names, write_atomically
+from taojax.files.tables import read_table
 from taojax.graph.optimise import check_extra
 from taojax.plots import CYCLE, PALE
-from taojax.records import read_run
 from taojax.runtime.score import score
-from taojax.specs import column_names, write_atomically
-from taojax.tables import read_table
 
 REAL = {
     "mit_corridor": (5.0, 10.0),

@@ -11,7 +11,7 @@ import nbformat
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
-from taojax.specs import write_atomically
+from taojax.files.specs import write_atomically
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from taojax.audit.figures import picture
-from taojax.specs import write_atomically
+from taojax.files.specs import write_atomically
 
 
 def save(figure: Figure, stem: Path, csv: str | None = None) -> None:

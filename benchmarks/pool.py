@@ -36,9 +36,9 @@ from taojax.datasets.simulate import (
     simulated_odometry,
 )
 from taojax.datasets.trajectory import motions
+from taojax.files.specs import read_npy
+from taojax.files.tables import MOTION, read_table, stacked
 from taojax.runtime.retrieval import retrieve
-from taojax.specs import read_npy
-from taojax.tables import MOTION, read_table, stacked
 
 REAL = {
     "mit_corridor": ("mit", (5.0, 10.0)),

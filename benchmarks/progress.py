@@ -31,10 +31,10 @@ from taojax.datasets.progress import (
     write_progress,
 )
 from taojax.datasets.trajectory import every
-from taojax.records import read_run
+from taojax.files.records import read_run
+from taojax.files.specs import read_npy, read_npz, write_atomically
+from taojax.files.tables import table_text
 from taojax.runtime.score import score
-from taojax.specs import read_npy, read_npz, write_atomically
-from taojax.tables import table_text
 
 R_IN_ROWS, R_OUT_ROWS = 2.0, 10.0
 SEEDS = (0, 1, 2, 3, 4)

@@ -21,8 +21,8 @@ import numpy as np
 from benchmarks.reliability_jobs import JOBS, Job, finish, make_data, start
 from benchmarks.reliability_targets import ROOT
 from taojax.errors import InputError
-from taojax.records import read_manifest, read_run, write_run
-from taojax.specs import column_names, load_spec
+from taojax.files.records import read_manifest, read_run, write_run
+from taojax.files.specs import column_names, load_spec
 
 WRITER = """
 import sys

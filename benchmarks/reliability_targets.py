@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taojax.specs import load_spec
+from taojax.files.specs import load_spec
 
 ROOT = Path(__file__).parents[1]
 N_MAP, N_QUERY, DIM, K = 40, 36, 8, 5
@@ -65,7 +65,7 @@ def _write_table(spec: str, folder: Path) -> None:
 
 
 def _read_table(spec: str, folder: Path, out: Path) -> list[np.ndarray]:
-    from taojax.tables import read_table
+    from taojax.files.tables import read_table
 
     table = read_table(folder / "table.csv", spec)
     may_blank = {c["name"] for c in load_spec(spec)["columns"] if c.get("blank")}

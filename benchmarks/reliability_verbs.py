@@ -68,7 +68,7 @@ def _inspect(folder: Path, out: Path) -> list[np.ndarray]:
 def _score(folder: Path, out: Path) -> list[np.ndarray]:
     small = ["--association", "rank", "--window", "3", "--branches", "4", "--no-progress"]
     command(["score", folder, "--out", out, *small])
-    from taojax.records import read_run, signal_names
+    from taojax.files.records import read_run, signal_names
 
     run = read_run(out)
     return [run.signals[name] for name in signal_names()]
@@ -127,7 +127,7 @@ def _sweep(folder: Path, out: Path) -> list[np.ndarray]:
 
 def reseal(run: Path) -> None:
     """Make a changed run look sealed, as a forger would."""
-    from taojax.records import SEALED, digest_file, seal_of
+    from taojax.files.records import SEALED, digest_file, seal_of
 
     path = run / "manifest.json"
     manifest = json.loads(path.read_text())

@@ -19,11 +19,11 @@ from taojax.datasets.simulate import (
     seen_places,
     simulated_odometry,
 )
+from taojax.files.tables import MOTION, read_table, stacked
 from taojax.runtime.observations import load_observations
 from taojax.runtime.retrieval import dense, retrieve
 from taojax.runtime.rivals import dense_lists
 from taojax.runtime.score import candidates
-from taojax.tables import MOTION, read_table, stacked
 
 REAL = {
     "mit_corridor": (5.0, 10.0),

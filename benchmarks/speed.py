@@ -38,13 +38,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.pictures import save
 from taojax.baselines.mht import MhtParams, mht
+from taojax.cli.bench import simulated_drive
 from taojax.config import StreamConfig
 from taojax.runtime import bench
 from taojax.runtime.bench import Row, best_us
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.stream import init, replay
-from taojax.verbs.bench import simulated_drive
 
 BASELINE = Path(__file__).parent / "speed_baseline.csv"
 TOLERANCE = 0.4

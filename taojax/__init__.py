@@ -13,7 +13,7 @@ __version__ = "0.2.0"
 if TYPE_CHECKING:
     from taojax.config import Config, StreamConfig
     from taojax.errors import ConfigError, InputError, TaojaxError
-    from taojax.results import Results, read_run
+    from taojax.files.results import Results, read_run
     from taojax.runtime.frames import STATUSES, Frame, StreamRecord
     from taojax.runtime.maps import MapTables, map_tables
     from taojax.runtime.stream import StreamState, init, replay, step
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "taojax.config": ("Config", "StreamConfig"),
     "taojax.errors": ("ConfigError", "InputError", "TaojaxError"),
-    "taojax.results": ("Results", "read_run"),
+    "taojax.files.results": ("Results", "read_run"),
     "taojax.runtime.maps": ("MapTables", "map_tables"),
     "taojax.runtime.frames": ("STATUSES", "Frame", "StreamRecord"),
     "taojax.runtime.stream": ("StreamState", "init", "replay", "step"),

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from taojax.detector import Detector, MapFacts
 from taojax.errors import InputError
-from taojax.specs import column_names, read_text
+from taojax.files.specs import column_names, read_text
 
 LARGEST_LOG_ODDS = 30.0
 """Keeps probabilities inside (0, 1) in float64."""

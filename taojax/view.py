@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from taojax.closures import Graph, Verdicts
 from taojax.errors import MissingExtraError
-from taojax.parts import locked_part
-from taojax.records import Run
-from taojax.specs import fail
+from taojax.files.atomic_write import locked_part
+from taojax.files.pose_graph_io import Graph, Verdicts
+from taojax.files.records import Run
+from taojax.files.specs import fail
 
 if TYPE_CHECKING:
     import rerun as rr

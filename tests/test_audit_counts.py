@@ -8,7 +8,7 @@ import pytest
 
 from taojax.audit import summary_text as counts
 from taojax.audit.summary_text import find_words, metric_row
-from taojax.tables import read_table
+from taojax.files.tables import read_table
 
 
 @pytest.fixture(scope="module")

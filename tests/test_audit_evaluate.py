@@ -8,13 +8,13 @@ import judged
 import numpy as np
 import pytest
 
-from taojax import records
 from taojax.audit.evaluate import evaluate
 from taojax.audit.report import write_summary
 from taojax.audit.tables import to_latex, to_markdown
 from taojax.errors import InputError
+from taojax.files import records
+from taojax.files.tables import read_table
 from taojax.risk import from_toml
-from taojax.tables import read_table
 
 FILES = {
     "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "calibration.toml", "report.html",

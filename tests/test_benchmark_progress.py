@@ -8,8 +8,8 @@ import pytest
 from benchmarks import __main__, progress
 from taojax.config import AuditConfig, Config, StreamConfig
 from taojax.datasets.progress import ProgressConfig
-from taojax.specs import load_spec
-from taojax.tables import read_table
+from taojax.files.specs import load_spec
+from taojax.files.tables import read_table
 
 # Rank association compiles quickly; what joint does on a line is in test_progress.py.
 SMALL = Config(

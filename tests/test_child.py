@@ -9,12 +9,12 @@ import time
 import pytest
 from conftest import write_folder
 
-from taojax.verbs import child
-from taojax.verbs.common import run_apart
+from taojax.cli import child
+from taojax.cli.common import run_apart
 
 STARTS = """
 import sys
-from taojax.verbs import child
+from taojax.cli import child
 with child.start(sys.argv[1:]) as started:
     print(started.pid, flush=True)
     started.wait()
@@ -22,7 +22,7 @@ with child.start(sys.argv[1:]) as started:
 
 RUNS = """
 import sys
-from taojax.verbs import child
+from taojax.cli import child
 print("ready", flush=True)
 child.HEARD_S = 0.1
 child.run([sys.argv[1:]])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from taojax.cli import main
-from taojax.records import signal_names
-from taojax.specs import column_names
+from taojax.files.records import signal_names
+from taojax.files.specs import column_names
 
 FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
 """Rank compiles in a fraction of the time; what is tested does not depend on it."""

@@ -11,11 +11,12 @@ import pytest
 from conftest import write_folder
 from judged import made_up, seal
 
-from taojax import closures, records
 from taojax.cli import main
 from taojax.errors import InputError
+from taojax.files import pose_graph_io as closures
+from taojax.files import records
+from taojax.files.tables import read_table, table_text
 from taojax.risk import to_toml
-from taojax.tables import read_table, table_text
 
 FLAGS = ["--window", "6", "--branches", "5", "--lag", "4", "--no-progress"]
 

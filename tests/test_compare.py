@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from taojax import records
 from taojax.audit import compare, figures, report, tables
 from taojax.audit import compare as compare_report
 from taojax.audit import metrics as bootstrap
@@ -18,7 +17,8 @@ from taojax.audit.evaluate import evaluate
 from taojax.cli import main
 from taojax.config import replace
 from taojax.errors import InputError
-from taojax.tables import read_table
+from taojax.files import records
+from taojax.files.tables import read_table
 
 
 def reseal(run, out, config=None, manifest=None, **changes):

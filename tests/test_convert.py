@@ -11,8 +11,8 @@ from conftest import motions, write_folder
 
 from taojax.cli import main
 from taojax.datasets.trajectory import integrate
+from taojax.files.tables import read_table
 from taojax.runtime.observations import load_observations
-from taojax.tables import read_table
 
 SETS = ("sthereo", "kri", "mulran", "complex-urban", "robotcar", "vivid", "folder", "files")
 FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]

@@ -9,8 +9,8 @@ from taojax.cli import main
 from taojax.datasets.files import NUMBERED, kind_of, read_motion, read_poses
 from taojax.datasets.trajectory import integrate
 from taojax.errors import InputError
+from taojax.files.tables import MOTION, POSE, read_table, stacked
 from taojax.runtime.observations import load_observations
-from taojax.tables import MOTION, POSE, read_table, stacked
 
 N_MAP, N_QUERY = 60, 40
 T_S = 1.6e9 + 0.5 * np.arange(N_QUERY)

@@ -15,8 +15,8 @@ from taojax.datasets.public_sets import (
     read_vivid,
 )
 from taojax.errors import InputError
+from taojax.files.tables import read_table
 from taojax.runtime.observations import load_observations
-from taojax.tables import read_table
 
 FRAMES_S = foreign.stamps(58, 1.0, 0.13)
 TRUE = foreign.pose_at(FRAMES_S)

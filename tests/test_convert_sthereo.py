@@ -10,8 +10,8 @@ from taojax.cli import main
 from taojax.datasets.public_sets import check_sensors, read_frame_list, read_sthereo
 from taojax.datasets.sessions import Matching
 from taojax.errors import InputError
+from taojax.files.tables import read_table
 from taojax.runtime.observations import load_observations
-from taojax.tables import read_table
 
 CAMERA = "image/stereo_thermal_14_left"
 

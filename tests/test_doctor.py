@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 import taojax
-from taojax.cli import main
-from taojax.verbs import doctor
+from taojax.cli import doctor, main
 
 ROOT = Path(__file__).parents[1]
 
@@ -145,7 +144,7 @@ def test_the_extras_are_those_of_the_project():
 
 
 def test_the_cache_is_seen_in_a_fresh_process(tmp_path):
-    code = "from taojax.verbs.doctor import _jax; print(_jax()['cache'])"
+    code = "from taojax.cli.doctor import _jax; print(_jax()['cache'])"
     env = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu", "PATH": ""}
     done = subprocess.run(
         [sys.executable, "-c", code], env=env, cwd=ROOT, capture_output=True, text=True, check=True

@@ -10,14 +10,14 @@ import pytest
 from conftest import write_folder
 from judged import made_up, seal
 
-from taojax import records
 from taojax.cli import main
+from taojax.cli.explain_page import ranges
 from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.errors import InputError
+from taojax.files import records
+from taojax.files.tables import POSE
 from taojax.runtime.explain import explain
 from taojax.runtime.score import score
-from taojax.tables import POSE
-from taojax.verbs.explain_page import ranges
 
 SHAPE = {"window": 6, "branches": 5}
 LAG = VerdictConfig(lag=4, window_frames=4)
@@ -207,7 +207,7 @@ def test_a_path_that_differs_is_exit_1_and_explains_nothing(folder, capsys, monk
     run = records.read_run(folder / "joint")
     # A cost that no path has; the seal was checked before.
     run.delayed["cost"] += 1.0
-    monkeypatch.setattr("taojax.records.read_run", lambda path: run)
+    monkeypatch.setattr("taojax.files.records.read_run", lambda path: run)
     line = fails(capsys, 1, folder / "joint", "--frame", 10)
     assert "nothing can be explained" in line
 

@@ -14,9 +14,9 @@ from jax import export
 import taojax
 from taojax.cli import main
 from taojax.config import from_toml
-from taojax.records import digest_file, read_manifest, signal_names
+from taojax.files.records import digest_file, read_manifest, signal_names
+from taojax.files.specs import load_spec
 from taojax.runtime.export import columns
-from taojax.specs import load_spec
 
 T = 60
 FLAGS = ["--window", "6", "--branches", "5", "--no-progress"]

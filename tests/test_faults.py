@@ -9,7 +9,7 @@ from benchmarks import __main__
 from benchmarks import reliability_faults as faults
 from taojax import cli
 from taojax.errors import InputError
-from taojax.records import read_run, refuse_if_taken
+from taojax.files.records import read_run, refuse_if_taken
 
 
 def test_a_killed_writer_leaves_whole_runs_only():

@@ -12,17 +12,16 @@ import pytest
 from test_cli import VERBS, fails
 
 from taojax import cli
-from taojax.cli import main, renamed
-from taojax.verbs import convert_flags
-from taojax.verbs.audit import Audit
-from taojax.verbs.common import Compiling, told
+from taojax.cli import convert_flags, main, renamed
+from taojax.cli.audit import Audit
+from taojax.cli.common import Compiling, told
 
 SETS = (
     "Sthereo", "Kri", "Mulran", "ComplexUrban", "Robotcar", "Vivid", "Folder", "Files", "Self"
 )  # fmt: skip
 PROGRAM = """
 import sys
-from taojax.verbs.cache import keep_compiled
+from taojax.cli.cache import keep_compiled
 said = keep_compiled(is_wanted="off" not in sys.argv)
 import jax
 if "full" in sys.argv:
@@ -37,7 +36,7 @@ def classes(verb):
     """The dataclasses that hold the flags of a verb."""
     if verb == "convert":
         return [getattr(convert_flags, name) for name in SETS]
-    return [getattr(importlib.import_module(f"taojax.verbs.{verb}"), verb.capitalize())]
+    return [getattr(importlib.import_module(f"taojax.cli.{verb}"), verb.capitalize())]
 
 
 def flags(verb):
@@ -124,7 +123,7 @@ def test_a_negative_seed_is_a_usage_error(words, data_folder, capsys):
 
 def test_bench_times_the_drive_of_its_seed_and_can_be_silent(tmp_path, capsys, monkeypatch):
     drives = []
-    monkeypatch.setattr("taojax.verbs.bench.simulated_drive", lambda *args: drives.append(args))
+    monkeypatch.setattr("taojax.cli.bench.simulated_drive", lambda *args: drives.append(args))
     monkeypatch.setattr(
         "taojax.runtime.bench.measure", lambda drive, *, quick, say: [say("timing")][:0]
     )
@@ -195,7 +194,7 @@ def test_the_command_line_keeps_what_is_compiled_and_the_library_does_not(tmp_pa
         "no": "from taojax import cli; cli.main(['doctor', '--json', '--no-cache'])",
     }.items():
         code = (
-            "from taojax.verbs import doctor; doctor._step = lambda: {'error': 'left out'}\n"
+            "from taojax.cli import doctor; doctor._step = lambda: {'error': 'left out'}\n"
             f"{call}\nprint(); print(doctor.json.dumps(doctor._jax()['cache']))"
         )
         done = subprocess.run(

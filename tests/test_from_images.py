@@ -17,7 +17,7 @@ from taojax.datasets.from_images import images_of, map_session  # noqa: E402
 from taojax.datasets.reading import PLAIN  # noqa: E402
 from taojax.datasets.sessions import Matching  # noqa: E402
 from taojax.errors import InputError  # noqa: E402
-from taojax.tables import POSE, read_table, stacked  # noqa: E402
+from taojax.files.tables import POSE, read_table, stacked  # noqa: E402
 
 FLAGS = ["--window", "6", "--branches", "5", "--association", "rank", "--no-progress"]
 """Rank compiles in a fraction of the time; what is tested does not depend on it."""

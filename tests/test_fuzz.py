@@ -14,9 +14,9 @@ from benchmarks.reliability_recordings import recordings
 from benchmarks.reliability_targets import own_files, tables
 from taojax.datasets.odometry import read_odometry
 from taojax.errors import InputError
-from taojax.records import digest_file
-from taojax.specs import read_bytes, read_npy, read_npz
-from taojax.tables import read_table
+from taojax.files.records import digest_file
+from taojax.files.specs import read_bytes, read_npy, read_npz
+from taojax.files.tables import read_table
 
 READERS = [*tables(), *own_files(), *recordings()]
 
@@ -108,7 +108,7 @@ def test_what_never_ends_is_not_read(tmp_path, kind):
 @pytest.mark.parametrize("stamp", ["9223372036854775808", "-9223372036854775809", "9" * 4000])
 def test_a_stamp_beyond_64_bits_is_one_line(tmp_path, monkeypatch, stamp):
     spec = {"columns": [{"name": "t_ns", "type": "stamp"}]}
-    monkeypatch.setattr("taojax.tables.load_spec", lambda name: spec)
+    monkeypatch.setattr("taojax.files.tables.load_spec", lambda name: spec)
     (tmp_path / "a.csv").write_text(f"t_ns\n1\n{stamp}\n")
     with pytest.raises(InputError, match=r"row 3, column t_ns: .* is outside"):
         read_table(tmp_path / "a.csv", "any")
@@ -116,6 +116,6 @@ def test_a_stamp_beyond_64_bits_is_one_line(tmp_path, monkeypatch, stamp):
 
 def test_stamps_at_both_ends_of_64_bits_are_in_order(tmp_path, monkeypatch):
     spec = {"columns": [{"name": "t_ns", "type": "stamp", "increasing": True}]}
-    monkeypatch.setattr("taojax.tables.load_spec", lambda name: spec)
+    monkeypatch.setattr("taojax.files.tables.load_spec", lambda name: spec)
     (tmp_path / "a.csv").write_text(f"t_ns\n{-(2**63)}\n{2**63 - 1}\n")
     assert read_table(tmp_path / "a.csv", "any")["t_ns"].tolist() == [-(2**63), 2**63 - 1]

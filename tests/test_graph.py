@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from conftest import loop, motions, write_folder
 
-from taojax import closures, records
 from taojax.audit import graph as judge
 from taojax.cli import main
-from taojax.closures import compose, wrap
 from taojax.config import AuditConfig
+from taojax.files import pose_graph_io as closures
+from taojax.files import records
+from taojax.files.pose_graph_io import compose, wrap
+from taojax.files.tables import read_table
 from taojax.graph import answers, methods, odometry
 from taojax.graph.answers import Answers, Closure, Run2D, Stream
 from taojax.graph.consistency import consistent, exact_clique, greedy_clique
 from taojax.graph.odometry import FEW, Chain, Noise
-from taojax.tables import read_table
 
 HAS_GTSAM = importlib.util.find_spec("gtsam") is not None
 needs_gtsam = pytest.mark.skipif(
@@ -270,7 +271,7 @@ def test_the_covariance_of_a_stretch_is_that_of_many_noisy_drives(rng):
 
 
 def _between(a, b):
-    from taojax.closures import between
+    from taojax.files.pose_graph_io import between
 
     return between(a, b)
 

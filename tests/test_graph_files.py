@@ -10,11 +10,11 @@ from conftest import write_folder
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import graph
-from taojax import records
 from taojax.audit.graph import TITLES
 from taojax.cli import main
-from taojax.specs import column_names
-from taojax.tables import read_table
+from taojax.files import records
+from taojax.files.specs import column_names
+from taojax.files.tables import read_table
 
 PAGE = (Path(__file__).parents[1] / "benchmarks/README.md").read_text(encoding="utf-8")
 HAS_GTSAM = importlib.util.find_spec("gtsam") is not None

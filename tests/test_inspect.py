@@ -9,11 +9,11 @@ import pytest
 from conftest import loop, write_folder
 
 from taojax.cli import main
+from taojax.cli.inspect_page import places, scale_of
 from taojax.errors import InputError
 from taojax.runtime import inspection
 from taojax.runtime.inspection import chance, histogram, views
 from taojax.runtime.observations import load_observations
-from taojax.verbs.inspect_page import places, scale_of
 
 ODOMETRY = "t_s,dx_m,dy_m,dtheta_rad"
 MAP, QUERY, TRUTH = "map/poses.csv", "query/odometry.csv", "truth/query_poses.csv"

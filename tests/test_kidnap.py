@@ -32,8 +32,8 @@ from taojax.datasets.kidnap import (
 from taojax.datasets.simulate import WorldConfig
 from taojax.datasets.trajectory import motions as true_motions
 from taojax.errors import InputError
+from taojax.files.tables import read_table
 from taojax.runtime.observations import load_observations
-from taojax.tables import read_table
 
 
 def small_source(n=200, n_map=220):

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
+from taojax.cli.layout import check_layout
 from taojax.errors import InputError
-from taojax.verbs.layout import check_layout
 
 
 def test_a_wrong_folder_is_refused_before_anything_heavy_is_imported(tmp_path):

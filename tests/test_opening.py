@@ -12,7 +12,7 @@ from taojax.audit.evaluate import evaluate
 from taojax.audit.judgement import Evaluation
 from taojax.audit.opening import KINDS, draw_opening, kinds_of
 from taojax.audit.summary_text import find_words, summary_words, terminal_words
-from taojax.tables import read_table
+from taojax.files.tables import read_table
 
 
 @pytest.fixture(scope="module")

@@ -11,18 +11,18 @@ from conftest import loop, motions, table
 from taojax.audit import own_map as judge
 from taojax.audit.graph import _laid
 from taojax.cli import main
-from taojax.closures import build_graph, g2o_text, read_verdicts
 from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.core.belief import combined, predict, read, uninformed, weigh
 from taojax.datasets.own_map import write_own_map
 from taojax.drive import known_frames
 from taojax.errors import InputError
+from taojax.files.pose_graph_io import build_graph, g2o_text, read_verdicts
+from taojax.files.records import read_run
+from taojax.files.tables import read_frames, read_table
 from taojax.graph.answers import read_answers
-from taojax.records import read_run
 from taojax.runtime import growing
 from taojax.runtime.maps import map_tables
 from taojax.runtime.observations import Observations, load_observations
-from taojax.tables import read_frames, read_table
 
 HAS_GTSAM = importlib.util.find_spec("gtsam") is not None
 needs_gtsam = pytest.mark.skipif(not HAS_GTSAM, reason="GTSAM is not installed")

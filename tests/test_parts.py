@@ -5,14 +5,14 @@ import sys
 
 import pytest
 
-from taojax.parts import clear_dead, locked_part
-from taojax.records import publish
-from taojax.specs import write_atomically
+from taojax.files.atomic_write import clear_dead, locked_part
+from taojax.files.records import publish
+from taojax.files.specs import write_atomically
 
 WRITER = """
 import sys
 from pathlib import Path
-from taojax.parts import locked_part
+from taojax.files.atomic_write import locked_part
 with locked_part(Path(sys.argv[1]), is_folder=sys.argv[2] == "folder") as part:
     print(part, flush=True)
     sys.stdin.read()

@@ -20,7 +20,7 @@ from taojax.datasets.progress import (
     write_progress,
 )
 from taojax.errors import ConfigError, InputError
-from taojax.records import read_run, signal_names
+from taojax.files.records import read_run, signal_names
 from taojax.runtime.observations import load_observations
 from taojax.runtime.score import score
 

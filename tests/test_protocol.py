@@ -10,7 +10,7 @@ from taojax.audit.html import about
 from taojax.audit.report import write_summary
 from taojax.audit.summary_text import PAPER_TABLE_2, mapout_table, metric_row
 from taojax.detector import probability
-from taojax.tables import read_table
+from taojax.files.tables import read_table
 
 
 @pytest.fixture(scope="module")

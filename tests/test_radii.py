@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from conftest import loop, motions
 
+from taojax.cli.inspect_page import drift_m
 from taojax.runtime import inspection
 from taojax.runtime.inspection import suggest_radii
-from taojax.verbs.inspect_page import drift_m
 
 
 @pytest.fixture(scope="module")

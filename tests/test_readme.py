@@ -13,8 +13,8 @@ import taojax
 from benchmarks import __main__ as benchmarks
 from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
 from taojax.cli import main
+from taojax.files.specs import column_names
 from taojax.runtime.rivals import SYSTEMS
-from taojax.specs import column_names
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "benchmarks/README.md", "notebooks/README.md", "data_specs/README.md")

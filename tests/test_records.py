@@ -6,9 +6,9 @@ import threading
 import numpy as np
 import pytest
 
-from taojax import records
 from taojax.errors import InputError
-from taojax.specs import column_names, load_spec
+from taojax.files import records
+from taojax.files.specs import column_names, load_spec
 
 
 def table(n=30):

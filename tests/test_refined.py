@@ -15,7 +15,7 @@ from taojax.audit.evaluate import evaluate
 from taojax.config import Config, StreamConfig, from_toml, replace, to_toml
 from taojax.core.cost import Branch
 from taojax.core.refine import refined_cost, refined_costs
-from taojax.records import read_run
+from taojax.files.records import read_run
 from taojax.runtime.explain import explain
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables

@@ -9,12 +9,13 @@ import judged
 import numpy as np
 import pytest
 
-from taojax import records
-from taojax.audit import figures, route
+from taojax.audit import figures
+from taojax.audit import frame_explorer as route
 from taojax.audit.evaluate import evaluate
 from taojax.audit.html import Page, glossary, marked, names_of_signals, render
 from taojax.audit.opening import TOO_SHORT, UNKNOWN, sentence
 from taojax.audit.summary_text import NO_SHIELD, find_words, span, warnings
+from taojax.files import records
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from taojax import records
 from taojax.audit import figures
 from taojax.audit import figures as scenario_figures
 from taojax.audit import summary_text as summary
@@ -16,6 +15,7 @@ from taojax.audit.evaluate import paste_files
 from taojax.audit.judgement import Evaluation, judge
 from taojax.audit.summary_text import MAIN, metric_row
 from taojax.audit.truth import read_truth
+from taojax.files import records
 
 
 def judgement_of(folder, **changes):

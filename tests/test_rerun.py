@@ -11,12 +11,11 @@ import pytest
 from conftest import ALONE, write_folder
 from judged import made_up
 
-from taojax import records
-from taojax.cli import main
+from taojax.cli import main, rerun
 from taojax.config import Config, StreamConfig, VerdictConfig, to_toml
+from taojax.files import records
 from taojax.risk import to_toml as calibration_toml
 from taojax.runtime.score import score
-from taojax.verbs import rerun
 
 SMALL = Config(
     stream=StreamConfig(window=6, branches=5),

@@ -10,14 +10,14 @@ import pytest
 from judged import evaluated, seal
 
 import taojax
-from taojax import records
 from taojax.audit.calibration import LOGISTIC
 from taojax.config import Config, StreamConfig, VerdictConfig
 from taojax.errors import InputError
-from taojax.results import SUMMARIES
+from taojax.files import records
+from taojax.files.results import SUMMARIES
+from taojax.files.specs import column_names
 from taojax.risk import from_toml
 from taojax.runtime.score import score
-from taojax.specs import column_names
 
 ANSWERED = ("probability_wrong_now", "probability_wrong")
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from conftest import write_folder
 
-from taojax import records
-from taojax.cli import main
+from taojax.cli import kidnap, main
+from taojax.cli.common import score_apart
+from taojax.cli.resume import BEGUN, claimed, is_sealed
 from taojax.config import Config, StreamConfig
 from taojax.errors import InputError
-from taojax.verbs import kidnap
-from taojax.verbs.common import score_apart
-from taojax.verbs.resume import BEGUN, claimed, is_sealed
+from taojax.files import records
 
 CONFIG = Config(stream=StreamConfig(window=3, branches=4, association="rank"))
 FLAGS = ["--window", "3", "--branches", "4", "--association", "rank", "--no-progress"]

@@ -170,7 +170,7 @@ def test_bad_input_is_one_line_with_file_row_and_fix(kind, data_folder):
 
 def test_a_bomb_in_an_archive_is_refused_before_it_unpacks(data_folder, monkeypatch):
     lists(data_folder, *good_lists())
-    monkeypatch.setattr("taojax.specs.MAX_BYTES", 1000)
+    monkeypatch.setattr("taojax.files.specs.MAX_BYTES", 1000)
     with pytest.raises(InputError, match="unpacks to more than"):
         load_observations(data_folder)
 

@@ -8,7 +8,7 @@ import reference
 from conftest import loop, motions
 
 from taojax.config import Config, StreamConfig
-from taojax.records import signal_names
+from taojax.files.records import signal_names
 from taojax.runtime import score
 from taojax.runtime.frames import STATUSES, Frame
 from taojax.runtime.maps import MapTables, map_spacing_m, map_tables

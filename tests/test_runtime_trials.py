@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from conftest import write_folder
 
-from taojax import records
 from taojax.cli import main
 from taojax.config import Config, StreamConfig, replace
 from taojax.errors import InputError
+from taojax.files import records
 from taojax.runtime import rivals
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables

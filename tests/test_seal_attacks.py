@@ -14,11 +14,11 @@ import pytest
 import test_wall
 from conftest import write_folder
 
-from taojax import records
 from taojax.baselines.sequence import sue
 from taojax.cli import main
 from taojax.config import Config, StreamConfig
 from taojax.errors import InputError
+from taojax.files import records
 from taojax.runtime import rivals
 from taojax.runtime.score import score
 

@@ -11,7 +11,7 @@ import reference_step as by_hand
 
 from taojax.config import StreamConfig, VerdictConfig
 from taojax.errors import InputError
-from taojax.records import signal_names
+from taojax.files.records import signal_names
 from taojax.runtime import hindsight
 from taojax.runtime.frames import STATUSES, Frame
 from taojax.runtime.maps import map_tables

@@ -12,7 +12,7 @@ from taojax.datasets.trajectories import read_trajectory as read_drive
 from taojax.datasets.trajectories import stamps_s
 from taojax.datasets.trajectory import integrate, motions
 from taojax.errors import InputError
-from taojax.specs import load_spec
+from taojax.files.specs import load_spec
 
 START_S = 1_600_000_000.0
 N = 40

@@ -15,8 +15,8 @@ from rerun.chunk import RrdReader  # noqa: E402
 from taojax.audit import figures  # noqa: E402
 from taojax.audit.evaluate import evaluate  # noqa: E402
 from taojax.cli import main  # noqa: E402
-from taojax.records import read_run  # noqa: E402
-from taojax.tables import POSE, read_table, stacked  # noqa: E402
+from taojax.files.records import read_run  # noqa: E402
+from taojax.files.tables import POSE, read_table, stacked  # noqa: E402
 from taojax.view import LABEL_COLOURS, VERDICT_COLOURS  # noqa: E402
 
 N_QUERY = 240

@@ -15,10 +15,10 @@ import pytest
 from conftest import write_folder
 
 import taojax
-from taojax import records
 from taojax.audit import calibration, labels, metrics
 from taojax.config import Config, StreamConfig
 from taojax.errors import InputError
+from taojax.files import records
 from taojax.runtime.score import score
 
 ROOT = Path(taojax.__file__).parents[1]

@@ -14,14 +14,14 @@ import pytest
 from conftest import write_folder
 from judged import made_up
 
-from taojax import records
 from taojax.cli import main
 from taojax.config import Config, StreamConfig, VerdictConfig, to_toml
 from taojax.errors import InputError
+from taojax.files import records
+from taojax.files.tables import read_table
 from taojax.risk import to_toml as calibration_toml
 from taojax.runtime.score import score
 from taojax.runtime.watch import MOST_BYTES, LineError, Watch, load_map, parse
-from taojax.tables import read_table
 
 SHAPE = {"window": 6, "branches": 5}
 LAG = VerdictConfig(lag=4, window_frames=4)

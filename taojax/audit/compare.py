@@ -16,10 +16,10 @@ from taojax.audit import figures, metrics, tables
 from taojax.audit import metrics as bootstrap
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.errors import InputError
+from taojax.files.records import input_hashes, publish, read_run
+from taojax.files.specs import fail, load_spec, read_bytes
+from taojax.files.tables import read_frames, read_table
 from taojax.plots import INK, PALE
-from taojax.records import input_hashes, publish, read_run
-from taojax.specs import fail, load_spec, read_bytes
-from taojax.tables import read_frames, read_table
 
 SIGNALS = ("top1", "tao", tables.FUSED)
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from taojax import plots
 from taojax.audit import calibration
 from taojax.audit.judgement import Evaluation, Judgement
-from taojax.specs import load_spec
+from taojax.files.specs import load_spec
 
 COMPARED = ("top1", "tao")
 

@@ -18,8 +18,10 @@ from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.html import Page, grid, render
 from taojax.audit.own_map import nearest_known
 from taojax.audit.truth import Truth, read_truth
-from taojax.closures import Verdicts, compose
 from taojax.config import AuditConfig
+from taojax.files.pose_graph_io import Verdicts, compose
+from taojax.files.records import Run
+from taojax.files.specs import write_atomically
 from taojax.graph.answers import Closure, Run2D, Stream, read_answers
 from taojax.graph.methods import (
     ALONE,
@@ -31,8 +33,6 @@ from taojax.graph.methods import (
     optimise_few,
 )
 from taojax.graph.optimise import INSTALL, has_extra
-from taojax.records import Run
-from taojax.specs import write_atomically
 from taojax.verdicts import plain
 
 __all__ = [

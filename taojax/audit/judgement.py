@@ -11,7 +11,7 @@ from taojax.audit.conformal import Promise
 from taojax.audit.truth import Truth
 from taojax.config import Config
 from taojax.detector import Detector, probability
-from taojax.records import Run, map_of, signal_names
+from taojax.files.records import Run, map_of, signal_names
 from taojax.risk import Calibration, for_run, shipped
 from taojax.verdicts import decide
 

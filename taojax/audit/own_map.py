@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.audit.truth import Truth
-from taojax.closures import between, compose
 from taojax.drive import known_frames
-from taojax.records import Run
-from taojax.tables import MOTION, POSE, stacked
+from taojax.files.pose_graph_io import between, compose
+from taojax.files.records import Run
+from taojax.files.tables import MOTION, POSE, stacked
 
 __all__ = ["in_truth", "nearest_known", "placed"]
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from taojax.audit.calibration import accepting_level
 from taojax.audit.labels import nearest_map_distance
 from taojax.audit.truth import Trials, read_trials, read_truth
-from taojax.records import Run, read_run
+from taojax.files.records import Run, read_run
 
 Z_95 = 1.959964
 

@@ -28,9 +28,9 @@ from taojax.audit.recovery import (
     recovery_rows,
 )
 from taojax.config import Config, to_toml
+from taojax.files.specs import write_atomically
+from taojax.files.tables import table_text
 from taojax.plots import CYCLE, IN_MAP, INK, MAP_OUT, PALE, STYLES, Mark
-from taojax.specs import write_atomically
-from taojax.tables import table_text
 from taojax.verdicts import plain
 
 BELIEFS = {

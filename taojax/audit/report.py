@@ -11,6 +11,7 @@ from taojax.audit import figures, protocol, tables
 from taojax.audit import figures as scenario_figures
 from taojax.audit import summary_text as summary
 from taojax.audit.figures import Picture
+from taojax.audit.frame_explorer import route_json
 from taojax.audit.html import (
     Grid,
     Opening,
@@ -23,7 +24,6 @@ from taojax.audit.html import (
 )
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.opening import draw_opening, numbers, sentence, summary_sentence
-from taojax.audit.route import route_json
 from taojax.audit.summary_text import (
     MAIN,
     VERDICT_FAR,
@@ -35,7 +35,7 @@ from taojax.audit.summary_text import (
     rates_of,
     rates_table,
 )
-from taojax.specs import read_npz, write_atomically
+from taojax.files.specs import read_npz, write_atomically
 
 _ALL_FRAMES = ("signal", "n_in", "n_out", "prevalence", "auroc", "aupr_out", "aupr_in", "far_at_95")
 _TEST = (

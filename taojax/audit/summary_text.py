@@ -14,7 +14,7 @@ from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.opening import TOO_SHORT, UNKNOWN, accepted_row, lines, sentence, summary_lines
 from taojax.audit.tables import NAN, Table, as_files, from_rows
-from taojax.tables import table_text
+from taojax.files.tables import table_text
 from taojax.verdicts import plain
 
 AMONG = {"FAR": "map-out", "FRR": "in-map"}

@@ -15,9 +15,9 @@ from taojax.audit.sweep_figures import NO_SETTING, draw, varied
 from taojax.audit.truth import read_truth
 from taojax.config import Config
 from taojax.errors import InputError
-from taojax.records import INPUTS, digest_file, read_manifest
-from taojax.specs import column_names, read_npz, write_atomically
-from taojax.tables import read_table, table_text
+from taojax.files.records import INPUTS, digest_file, read_manifest
+from taojax.files.specs import column_names, read_npz, write_atomically
+from taojax.files.tables import read_table, table_text
 from taojax.verdicts import plain
 
 N_TOP = 10

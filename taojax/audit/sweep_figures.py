@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from taojax.audit.figures import Picture, csv_text, picture
+from taojax.files.specs import column_names
 from taojax.plots import IN_MAP, MAP_OUT
-from taojax.specs import column_names
 
 BAND = (10.0, 50.0, 90.0)
 """Percentiles over the other settings that a sensitivity curve shows."""

@@ -11,9 +11,9 @@ from taojax.audit import metrics as bootstrap
 from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.config import AuditConfig
+from taojax.files.specs import load_spec
+from taojax.files.tables import format_number, table_text
 from taojax.risk import Risk
-from taojax.specs import load_spec
-from taojax.tables import format_number, table_text
 from taojax.verdicts import plain
 
 NAN = float("nan")

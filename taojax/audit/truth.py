@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from taojax.errors import InputError
-from taojax.records import digest_file
-from taojax.tables import read_table
+from taojax.files.records import digest_file
+from taojax.files.tables import read_table
 
 
 class Truth(NamedTuple):

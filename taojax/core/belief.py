@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from taojax.config import VerdictConfig
 from taojax.core.anchors import AnchorGrid, look_up
+from taojax.core.reductions import first_argmin
 from taojax.core.se2 import compose, inverse, rotate
-from taojax.core.sums import least
 
 _TINY = 1e-30
 
@@ -226,7 +226,7 @@ def read(
     """
     grid, gap_m = places.grid, places.gap_m
     m = grid.xy.shape[0]
-    best = least(-belief.mass.reshape(-1))
+    best = first_argmin(-belief.mass.reshape(-1))
     anchor, sign = best % m, jnp.where(best >= m, -1.0, 1.0)
     ahead = sign * grid.facing[anchor]
     dx, dy = grid.xy[:, 0] - grid.xy[anchor, 0], grid.xy[:, 1] - grid.xy[anchor, 1]

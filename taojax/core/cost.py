@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from taojax.core.procrustes import RigidFit, VectorPairs, fit_se2
-from taojax.core.sums import over_frames, trailing
+from taojax.core.reductions import broadcast_frames, sum_over_frames
 
 MIN_PAIRS = 3
 """Fewer supported frames than this do not determine an alignment worth trusting."""
@@ -142,8 +142,8 @@ def step_pairs(
         n pairs, the first of which weighs nothing.
     """
     both = jnp.concatenate([jnp.zeros_like(is_on[:1]), is_on[1:] & is_on[:-1]]).astype(p.dtype)
-    share = both * (total / jnp.maximum(over_frames(both), 1.0))[None]
-    return VectorPairs(_steps(trailing(p, both)), _steps(q), share)
+    share = both * (total / jnp.maximum(sum_over_frames(both), 1.0))[None]
+    return VectorPairs(_steps(broadcast_frames(p, both)), _steps(q), share)
 
 
 def cost_terms(
@@ -183,13 +183,13 @@ def _terms(
     squared: Float[Array, "n *k"],
 ) -> Terms:
     rho = jnp.where(branch.has_anchor, huber(squared, params.delta_m), params.tau_missing)
-    own = trailing(weight, rho)
+    own = broadcast_frames(weight, rho)
     steps = step_pairs(p, _clean(branch), branch.has_anchor & (own > 0))
     similarity = jnp.where(branch.has_anchor, branch.similarity, 0.0)
     return Terms(
-        geom=over_frames(own * rho),
-        vel=params.lambda_velocity * over_frames(steps.weight * _squared(turn, *steps[:2])),
-        sim=params.gamma_similarity * over_frames(own * (1.0 - similarity)),
+        geom=sum_over_frames(own * rho),
+        vel=params.lambda_velocity * sum_over_frames(steps.weight * _squared(turn, *steps[:2])),
+        sim=params.gamma_similarity * sum_over_frames(own * (1.0 - similarity)),
     )
 
 
@@ -219,13 +219,13 @@ def branch_cost(
         meaning of lambda when the window changes.
     """
     q = _clean(branch)
-    supported = jnp.where(branch.has_anchor, trailing(weight, branch.has_anchor), 0.0)
-    local = trailing(p, supported)
+    supported = jnp.where(branch.has_anchor, broadcast_frames(weight, branch.has_anchor), 0.0)
+    local = broadcast_frames(p, supported)
 
     def fit(own: Float[Array, "n *k"]) -> RigidFit:
         # The factor 2 is the 1/2 in rho: Eq. 1 weighs |dq - R dp|^2, not half of it. The fit
         # itself takes its weights as they sum, so the steps must share as much.
-        steps = step_pairs(p, q, own > 0, 2.0 * params.lambda_velocity * over_frames(own))
+        steps = step_pairs(p, q, own > 0, 2.0 * params.lambda_velocity * sum_over_frames(own))
         return fit_se2(p, q, own, steps)
 
     first = fit(supported)
@@ -250,4 +250,4 @@ def branch_cost(
 
 
 def _count(is_on: Bool[Array, "n *k"], like: Array) -> Float[Array, "*k"]:
-    return over_frames(is_on.astype(like.dtype))
+    return sum_over_frames(is_on.astype(like.dtype))

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from taojax.core.sums import over_frames, trailing
+from taojax.core.reductions import broadcast_frames, sum_over_frames
 
 
 class VectorPairs(NamedTuple):
@@ -74,9 +74,9 @@ def _safe_sqrt(x: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 def weighted_mean(p: Float[Array, "n *#k 2"], weight: Float[Array, "n *k"]) -> Float[Array, "*k 2"]:
     """Return the weighted mean of points, zero where there is no weight at all."""
-    total = over_frames(weight)
+    total = sum_over_frames(weight)
     share = 1.0 / jnp.where(total > 0, total, 1.0)
-    axes = [share * over_frames(weight * p[..., axis]) for axis in range(2)]
+    axes = [share * sum_over_frames(weight * p[..., axis]) for axis in range(2)]
     return jnp.stack(axes, axis=-1)
 
 
@@ -92,7 +92,7 @@ def angle_evidence(*pairs: VectorPairs) -> AngleEvidence:
         dot = dot + weight * (x0 * y0 + x1 * y1)
         cross = cross + weight * (x0 * y1 - x1 * y0)
         scale = scale + weight * jnp.sqrt((x0**2 + x1**2) * (y0**2 + y1**2))
-    return AngleEvidence(*(over_frames(jnp.asarray(part)) for part in (dot, cross, scale)))
+    return AngleEvidence(*(sum_over_frames(jnp.asarray(part)) for part in (dot, cross, scale)))
 
 
 def fit_se2(
@@ -124,14 +124,14 @@ def fit_se2(
     Source:
         Umeyama, IEEE TPAMI 13(4), 1991, specialised to dimension 2 and scale 1; paper, Eq. 1.
     """
-    p = trailing(p, weight)
+    p = broadcast_frames(p, weight)
     p_mean, q_mean = weighted_mean(p, weight), weighted_mean(q, weight)
     centred = p - p_mean[None], q - q_mean[None]
     dot, cross, scale = angle_evidence(VectorPairs(*centred, weight), *more)
     # Relative, so that millimetres and kilometres are judged alike, and written so that NaN is bad.
     tolerance = 100.0 * jnp.finfo(p.dtype).eps
     strength = _safe_sqrt(dot**2 + cross**2)
-    is_degenerate = ~((strength > tolerance * scale) & (over_frames(weight) > 0))
+    is_degenerate = ~((strength > tolerance * scale) & (sum_over_frames(weight) > 0))
     # A harmless division when degenerate, so that its gradient stays finite.
     unit = 1.0 / jnp.where(is_degenerate, 1.0, strength)
     c, s = jnp.where(is_degenerate, 1.0, dot * unit), jnp.where(is_degenerate, 0.0, cross * unit)

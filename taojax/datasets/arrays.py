@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from taojax.specs import ARRAY_FAULTS, GZIP, MAX_BYTES, fail, first_line, load_spec, read_npy
+from taojax.files.specs import ARRAY_FAULTS, GZIP, MAX_BYTES, fail, first_line, load_spec, read_npy
 
 __all__ = [
     "blocks", "check_begin", "check_kind", "is_native", "kind_notes", "map_archive", "map_npy",

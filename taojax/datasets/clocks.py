@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from taojax.datasets.trajectory import driven_m, wrap
-from taojax.specs import fail
+from taojax.files.specs import fail
 
 __all__ = ["FASTEST_S", "PER_S", "Ordered", "in_order", "offset_of", "seconds"]
 

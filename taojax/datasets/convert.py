@@ -17,7 +17,7 @@ from taojax.datasets.reading import PLAIN, Drive, Reading
 from taojax.datasets.simulate import WorldConfig, describe_routes
 from taojax.datasets.trajectory import Trajectory, driven_m, every, motions, pose_at, spaced
 from taojax.errors import InputError
-from taojax.specs import fail
+from taojax.files.specs import fail
 
 __all__ = [
     "Assembled",

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from taojax.errors import InputError, MissingExtraError
-from taojax.records import digest_file
-from taojax.specs import fail, first_line, read_bytes, write_atomically
+from taojax.files.records import digest_file
+from taojax.files.specs import fail, first_line, read_bytes, write_atomically
 
 __all__ = [
     "Described",

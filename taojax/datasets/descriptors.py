@@ -28,7 +28,7 @@ from taojax.datasets.arrays import (
 )  # fmt: skip
 from taojax.datasets.folder import Descriptors, Lists, Session
 from taojax.datasets.lists import H5_SUFFIXES, Names, has_scores, open_features, read_lists
-from taojax.specs import fail
+from taojax.files.specs import fail
 
 __all__ = ["goes_by_name", "read_side", "read_views", "view_notes"]
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from taojax.about import read_about
 from taojax.datasets.convert import Choices, assemble, on_the_clock_of
 from taojax.datasets.descriptors import read_side
 from taojax.datasets.files import NUMBERED, read_poses
@@ -28,8 +27,9 @@ from taojax.datasets.reading import PLAIN, Reading
 from taojax.datasets.simulate import World
 from taojax.datasets.trajectory import Trajectory, pose_at
 from taojax.errors import InputError
-from taojax.specs import fail
-from taojax.tables import MOTION, POSE, read_table
+from taojax.files.dataset_info import read_about
+from taojax.files.specs import fail
+from taojax.files.tables import MOTION, POSE, read_table
 
 __all__ = [
     "SCENARIOS",

@@ -31,8 +31,8 @@ from taojax.datasets.trajectories import (
 )  # fmt: skip
 from taojax.datasets.trajectory import Trajectory, headings, integrate
 from taojax.errors import InputError
-from taojax.specs import fail, load_spec, read_npy, read_text
-from taojax.tables import MOTION, POSE, stacked
+from taojax.files.specs import fail, load_spec, read_npy, read_text
+from taojax.files.tables import MOTION, POSE, stacked
 
 __all__ = ["DERIVED", "NUMBERED", "Drive", "MotionKind", "kind_of", "read_motion", "read_poses"]
 

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 
 from taojax.datasets.trajectory import Trajectory
 from taojax.errors import InputError
-from taojax.parts import locked_part
-from taojax.tables import MOTION, POSE, table_text
+from taojax.files.atomic_write import locked_part
+from taojax.files.tables import MOTION, POSE, table_text
 
 __all__ = [
     "Descriptors", "Lists", "Session", "about_text", "map_parts", "origin_of", "stamped_text",

@@ -20,8 +20,8 @@ from taojax.datasets.plain import session_of
 from taojax.datasets.reading import Drive, Reading
 from taojax.datasets.sessions import Matching, matched_session
 from taojax.datasets.trajectory import Trajectory, pose_at
-from taojax.records import code_digest
-from taojax.specs import fail
+from taojax.files.records import code_digest
+from taojax.files.specs import fail
 
 __all__ = ["Images", "images_of", "key_of", "map_session", "query_session"]
 

@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from taojax.about import read_about
 from taojax.datasets.folder import stamped_text
 from taojax.datasets.simulate import NOTE, WorldConfig, make_world, seen_places
 from taojax.datasets.trajectory import motions
 from taojax.errors import InputError
-from taojax.specs import read_npy, read_npz, write_atomically
-from taojax.tables import MOTION, POSE, read_table, stacked, table_text
+from taojax.files.dataset_info import read_about
+from taojax.files.specs import read_npy, read_npz, write_atomically
+from taojax.files.tables import MOTION, POSE, read_table, stacked, table_text
 
 __all__ = [
     "LEVELS",

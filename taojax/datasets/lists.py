@@ -20,8 +20,8 @@ from taojax.datasets.arrays import (  # fmt: skip
 )
 from taojax.datasets.folder import Lists, Session
 from taojax.errors import InputError
-from taojax.specs import fail, load_spec, read_text
-from taojax.tables import read_table
+from taojax.files.specs import fail, load_spec, read_text
+from taojax.files.tables import read_table
 
 __all__ = [
     "H5_SUFFIXES",

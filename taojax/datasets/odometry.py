@@ -20,8 +20,8 @@ from taojax.datasets.text_tables import read_rows, values_of
 from taojax.datasets.trajectories import NUMBERED, read_trajectory, row_of, stamps_s, text_columns
 from taojax.datasets.trajectory import Trajectory, every, integrate, motions, pose_at
 from taojax.errors import InputError
-from taojax.specs import fail, read_text
-from taojax.tables import MOTION, read_table
+from taojax.files.specs import fail, read_text
+from taojax.files.tables import MOTION, read_table
 
 __all__ = ["OdometryKind", "odometry_at", "read_odometry", "read_wheels", "simulated"]
 

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from taojax.about import DESCRIPTORS, read_about
 from taojax.datasets.folder import Descriptors, Lists, write_folder
 from taojax.datasets.simulate import WorldConfig, simulated_odometry
 from taojax.datasets.trajectory import Trajectory, integrate
 from taojax.errors import InputError
-from taojax.specs import read_npy, read_npz
-from taojax.tables import MOTION, POSE, read_table, stacked
+from taojax.files.dataset_info import DESCRIPTORS, read_about
+from taojax.files.specs import read_npy, read_npz
+from taojax.files.tables import MOTION, POSE, read_table, stacked
 
 __all__ = ["GAP_M", "write_own_map"]
 

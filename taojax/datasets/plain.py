@@ -23,8 +23,8 @@ from taojax.datasets.folder import Session
 from taojax.datasets.reading import PLAIN, Drive, Reading
 from taojax.datasets.trajectory import Trajectory, headings
 from taojax.errors import InputError
-from taojax.specs import fail, load_spec, read_bytes
-from taojax.tables import read_table
+from taojax.files.specs import fail, load_spec, read_bytes
+from taojax.files.tables import read_table
 
 __all__ = ["found_in", "read_files", "read_plain", "read_session", "read_traverse", "session_of"]
 

@@ -22,8 +22,8 @@ from taojax.datasets.sessions import (
 from taojax.datasets.trajectories import row_of
 from taojax.datasets.trajectory import Trajectory, headings
 from taojax.errors import InputError
-from taojax.specs import column_names, fail, read_text
-from taojax.tables import read_table
+from taojax.files.specs import column_names, fail, read_text
+from taojax.files.tables import read_table
 
 __all__ = [
     "IMAGES",

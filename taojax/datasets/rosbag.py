@@ -10,7 +10,7 @@ from taojax.datasets.reading import Drive, Plane
 from taojax.datasets.trajectories import LARGEST, flat_poses, rotations
 from taojax.datasets.trajectory import Trajectory
 from taojax.errors import InputError, MissingExtraError
-from taojax.specs import fail
+from taojax.files.specs import fail
 
 __all__ = ["read_bag"]
 

@@ -11,7 +11,7 @@ from taojax.datasets.folder import Session
 from taojax.datasets.trajectories import looks_like, row_of
 from taojax.datasets.trajectory import Trajectory, headings, pose_at, spaced, wrap
 from taojax.errors import InputError
-from taojax.specs import fail
+from taojax.files.specs import fail
 
 __all__ = [
     "Matching",

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taojax.errors import InputError
-from taojax.specs import fail, load_spec, read_text
-from taojax.tables import is_number
+from taojax.files.specs import fail, load_spec, read_text
+from taojax.files.tables import is_number
 
 __all__ = ["COMPASS", "NAMES", "Column", "TextRows", "find_columns", "read_rows", "values_of"]
 

@@ -29,8 +29,8 @@ from taojax.datasets.text_tables import (
 )
 from taojax.datasets.trajectory import Trajectory, driven_m, headings, motions, spaced
 from taojax.errors import InputError
-from taojax.specs import fail, load_spec, read_text
-from taojax.tables import is_number
+from taojax.files.specs import fail, load_spec, read_text
+from taojax.files.tables import is_number
 
 __all__ = [
     "CLEAR_RAD",

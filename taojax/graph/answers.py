@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from taojax.closures import Verdicts, between, build_graph, read_verdicts, wrap
 from taojax.errors import InputError
-from taojax.records import Run
+from taojax.files.pose_graph_io import Verdicts, between, build_graph, read_verdicts, wrap
+from taojax.files.records import Run
 
 __all__ = ["DIRECTION_RAD", "Answers", "Closure", "Run2D", "Stream", "Tie", "read_answers"]
 

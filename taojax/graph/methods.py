@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from taojax.closures import between, compose
+from taojax.files.pose_graph_io import between, compose
 from taojax.graph.answers import Answers, Closure, Run2D, Stream
 from taojax.graph.consistency import consistent, exact_clique, greedy_clique
 from taojax.graph.odometry import DRIFTING, FEW, Chain, Noise, dead_reckoning, estimate, steps_m

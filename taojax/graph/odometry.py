@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from taojax.closures import ODOMETRY_RAD, ODOMETRY_SHARE, compose, wrap
+from taojax.files.pose_graph_io import ODOMETRY_RAD, ODOMETRY_SHARE, compose, wrap
 from taojax.graph.answers import Closure
 
 __all__ = [

@@ -10,8 +10,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from taojax.closures import between, compose, in_axes_of, wrap
 from taojax.errors import MissingExtraError
+from taojax.files.pose_graph_io import between, compose, in_axes_of, wrap
 from taojax.graph.answers import Closure
 from taojax.graph.odometry import Chain, dead_reckoning
 

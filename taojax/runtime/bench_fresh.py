@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 
-from taojax import specs
+from taojax.files import specs
 
 
 class Row(NamedTuple):
@@ -135,7 +135,7 @@ def needed() -> set[str]:
 
 def installed() -> list[Row]:
     """Measure the room that the package takes, alone and with all it needs."""
-    package = Path(specs.__file__).parent
+    package = Path(specs.__file__).parents[1]
     own = _bytes_below(package)
     if not (package / "data_specs").is_dir():
         # A source checkout has them beside the package, a wheel inside.

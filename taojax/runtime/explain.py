@@ -18,10 +18,10 @@ from taojax.core.belief import Places
 from taojax.core.path import Window, along
 from taojax.core.se2 import between, integrate, transform
 from taojax.errors import InputError
-from taojax.records import Run
+from taojax.files.records import Run
+from taojax.files.tables import MOTION, POSE, read_table, stacked
 from taojax.runtime import hindsight
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.tables import MOTION, POSE, read_table, stacked
 from taojax.verdicts import SILENT
 
 TOLERANCE = 1e-4

@@ -19,7 +19,7 @@ from jax import export
 
 from taojax.config import Config, StreamConfig, VerdictConfig, to_toml
 from taojax.errors import MissingExtraError
-from taojax.records import SCHEMA, archive, digest, publish, refuse_if_taken, seal_of
+from taojax.files.records import SCHEMA, archive, digest, publish, refuse_if_taken, seal_of
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import load_observations

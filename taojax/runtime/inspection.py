@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from taojax.about import read_about
 from taojax.errors import InputError
+from taojax.files.dataset_info import read_about
+from taojax.files.specs import fail, read_npy, read_npz
+from taojax.files.tables import read_table
 from taojax.runtime.maps import NEAR_SPACINGS, map_spacing_m, view_map
 from taojax.runtime.observations import Observations, descriptor_names, load_observations
 from taojax.runtime.retrieval import normalise, retrieve
-from taojax.specs import fail, read_npy, read_npz
-from taojax.tables import read_table
 
 __all__ = [
     "SECONDS",

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from taojax.about import DESCRIPTORS, read_about
 from taojax.errors import InputError
-from taojax.records import INPUTS, digest_file
-from taojax.specs import read_npy, read_npz
-from taojax.tables import MOTION, POSE, read_table, stacked
+from taojax.files.dataset_info import DESCRIPTORS, read_about
+from taojax.files.records import INPUTS, digest_file
+from taojax.files.specs import read_npy, read_npz
+from taojax.files.tables import MOTION, POSE, read_table, stacked
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from taojax.baselines.particles import ParticleParams, particles
 from taojax.baselines.sequence import seqslam, sue
 from taojax.baselines.topometric import TopometricParams, topometric
 from taojax.baselines.trajectory_prior import trajectory_prior
-from taojax.records import SealedTrack
+from taojax.files.records import SealedTrack
 from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.observations import Observations
 from taojax.runtime.retrieval import dense

@@ -17,7 +17,8 @@ from taojax import __version__
 from taojax.config import Config, StreamConfig, replace, to_toml
 from taojax.detector import foreign_map
 from taojax.errors import InputError
-from taojax.records import SealedTrack, code_digest, map_of, refuse_if_taken, write_run
+from taojax.files.records import SealedTrack, code_digest, map_of, refuse_if_taken, write_run
+from taojax.files.specs import read_bytes
 from taojax.risk import SHIPPED, Calibration, for_run, shipped
 from taojax.risk import to_toml as calibration_toml
 from taojax.runtime import growing, hindsight
@@ -28,7 +29,6 @@ from taojax.runtime.parallel import CUT, WHOLE, device_mesh, gather, place
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
 from taojax.runtime.stream import COMPILING, answered, init, literal, replay
-from taojax.specs import read_bytes
 from taojax.verdicts import decide
 
 SAME = 1e-4

@@ -15,8 +15,8 @@ from taojax.config import Config, StreamConfig
 from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost, huber
 from taojax.core.history import push
 from taojax.core.procrustes import diagnose, weighted_mean
+from taojax.core.reductions import first_argmin, sum_over_frames
 from taojax.core.se2 import inverse, transform
-from taojax.core.sums import least, over_frames
 from taojax.errors import InputError
 from taojax.runtime import hindsight
 from taojax.runtime.frames import (
@@ -57,7 +57,9 @@ def windowed_means(history: Float[Array, " w"], n_seen: Int[Array, ""]) -> Float
     age = jnp.arange(history.shape[0])[::-1, None]
     lengths = jnp.minimum(jnp.asarray(WINDOWS), n_seen)
     is_in = (age < lengths[None]).astype(history.dtype)
-    return over_frames(is_in * history[:, None]) / jnp.maximum(lengths.astype(history.dtype), 1.0)
+    return sum_over_frames(is_in * history[:, None]) / jnp.maximum(
+        lengths.astype(history.dtype), 1.0
+    )
 
 
 def margin(similarity: Float[Array, " k"]) -> Float[Array, ""]:
@@ -75,7 +77,9 @@ def entropy(
     logits = (similarity - similarity[0]) / temperature
     weight = jnp.where(is_there, jnp.exp(logits), 0.0)
     # -sum p log p with p = w / total, where log w is the logit.
-    total, energy = over_frames(jnp.stack([weight, weight * jnp.where(is_there, logits, 0.0)], 1))
+    total, energy = sum_over_frames(
+        jnp.stack([weight, weight * jnp.where(is_there, logits, 0.0)], 1)
+    )
     safe = jnp.where(total > 0, total, 1.0)
     nats = jnp.maximum(jnp.log(safe) - energy / safe, 0.0)
     return jnp.where(total > 0, nats, jnp.log(float(similarity.shape[0])))
@@ -220,13 +224,13 @@ def _own_weight(frame: Frame, like: Array) -> Array:
 def window_weight(given: Float[Array, " n"], is_filled: Bool[Array, " n"]) -> Float[Array, " n"]:
     """Return the weights of a window, summing to one; all alike where none weighs anything."""
     filled = is_filled.astype(given.dtype)
-    own = jnp.where(over_frames(given) > 0, given, filled)
-    return own / over_frames(own)
+    own = jnp.where(sum_over_frames(given) > 0, given, filled)
+    return own / sum_over_frames(own)
 
 
 def _share(is_inlier: Bool[Array, " n"], is_filled: Bool[Array, " n"]) -> Float[Array, ""]:
     """Return the share of the filled window frames that are inliers."""
-    n_in, n = over_frames(jnp.stack([is_inlier, is_filled], axis=1).astype(jnp.float32))
+    n_in, n = sum_over_frames(jnp.stack([is_inlier, is_filled], axis=1).astype(jnp.float32))
     return n_in / n
 
 
@@ -348,10 +352,10 @@ def _literal(
     params = cost_params(config, tables)
     branches = Branch(jnp.swapaxes(q, 1, 2), s, has_anchor)
     costs = rank_costs(config, params, p, branches, weight)
-    cheapest = least(costs.total)
+    cheapest = first_argmin(costs.total)
     # The signal is the minimum over all branches; a pose needs a candidate in the newest frame.
     has_candidates = jnp.any(is_there)
-    rank = least(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
+    rank = first_argmin(jnp.where(is_there | ~has_candidates, costs.total, jnp.inf))
     shape = diagnose(p, q[:, :, rank], jnp.where(has_anchor[:, rank], weight, 0.0), config.eps)
 
     n_seen = jnp.minimum(state.n_seen + 1, max(config.window, *WINDOWS))

@@ -23,15 +23,15 @@ from taojax.config import Config, StreamConfig, VerdictConfig, read_toml, replac
 from taojax.core.cost import Branch
 from taojax.core.se2 import inverse, transform
 from taojax.errors import ConfigError, InputError
-from taojax.records import SCHEMA, digest, read_manifest, refuse_if_taken, seal_of
+from taojax.files.records import SCHEMA, digest, read_manifest, refuse_if_taken, seal_of
+from taojax.files.specs import write_atomically
+from taojax.files.tables import table_text
 from taojax.runtime import hindsight
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import load_observations
 from taojax.runtime.score import candidates, facts_of
 from taojax.runtime.stream import cost_params, rank_costs
-from taojax.specs import write_atomically
-from taojax.tables import table_text
 
 RANK = (
     "lambda_velocity", "gamma_similarity", "tau_masks", "delta_spacings", "mask_deltas", "window",

@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.about import DESCRIPTORS
 from taojax.config import Config, StreamConfig
 from taojax.detector import MapFacts
 from taojax.errors import InputError
-from taojax.records import digest_file
+from taojax.files.dataset_info import DESCRIPTORS
+from taojax.files.records import digest_file
+from taojax.files.specs import read_npy
+from taojax.files.tables import POSE, read_table, stacked
 from taojax.risk import Calibration, shipped
 from taojax.runtime import hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
@@ -29,8 +31,6 @@ from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import descriptor_names
 from taojax.runtime.retrieval import N_KEPT
 from taojax.runtime.stream import answered, init, literal, step
-from taojax.specs import read_npy
-from taojax.tables import POSE, read_table, stacked
 from taojax.verdicts import SILENT, judged
 
 MOST_BYTES = 1 << 20

@@ -1,1 +1,0 @@
-"""The verbs of the command line, one file each; a verb imports its room only when it runs."""
