@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.sets import DataSet
-from taojax import detector
+from taojax import risk as detector
 from taojax.audit import calibration, labels, risk, sequential
-from taojax.baselines.frames import Frames
+from taojax.baselines.models import Frames
 from taojax.config import Config
 from taojax.risk import for_run, probability_wrong, shipped
 from taojax.runtime import hindsight

@@ -21,7 +21,7 @@ from benchmarks import sets
 from benchmarks.entrants import rivals
 from taojax.audit import labels, tables
 from taojax.audit.judgement import Judgement, judge
-from taojax.audit.truth import read_truth
+from taojax.audit.labels import read_truth
 from taojax.config import AuditConfig, Config
 from taojax.datasets.progress import (
     ProgressConfig,

@@ -174,7 +174,7 @@ def poisoned(is_cleaned: bool, at: int = 30, n: int = 100) -> int:
         n: frames.
     """
     from taojax.baselines import topometric
-    from taojax.baselines.frames import Frames
+    from taojax.baselines.models import Frames
     from taojax.runtime.rivals import dense_lists
 
     _, frames = recording(n)

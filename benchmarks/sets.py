@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from taojax.audit.truth import read_truth
+from taojax.audit.labels import read_truth
 from taojax.datasets.edit import SCENARIO_SEGMENTS_M as SEGMENTS_M
 from taojax.datasets.edit import kept_by_segments, scenario
 from taojax.datasets.kidnap import read_poses

@@ -24,8 +24,7 @@ from taojax.audit import labels
 from taojax.audit import risk as judge
 from taojax.audit.calibration import fit_logistic
 from taojax.config import AuditConfig, VerdictConfig
-from taojax.detector import Detector
-from taojax.risk import Calibration, Risk, at_most, probability_wrong
+from taojax.risk import Calibration, Detector, Risk, at_most, probability_wrong
 from taojax.runtime import hindsight
 from taojax.runtime.maps import map_tables
 from taojax.verdicts import POSE

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from taojax import Config, Frame, detector, map_tables
+from taojax import Config, Frame, map_tables
+from taojax import risk as detector
 from taojax.audit import calibration, labels, metrics
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world

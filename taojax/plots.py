@@ -19,15 +19,12 @@ CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), "-")
 
 LEAST_SIDE = 0.22
-
 """The shorter side of a drawn map, of its longer one: a corridor keeps room for its marks."""
 
 MAP_MARGIN = 0.04
-
 """Room around a map, of its longer side."""
 
 BELOW_MAP_IN = 1.75
-
 """Room for labels and four rows of legend below a map, inches."""
 
 
@@ -48,7 +45,6 @@ OUTCOMES = {
     "rejected_in": Mark("rejected though in the map", "#CC79A7", "s", 14),
     "accepted_wrong": Mark("accepted, wrong place", MAP_OUT, "X", 30),
 }
-
 """Outcome of a frame -> how it is drawn; the dangerous one last, on top."""
 
 
@@ -327,23 +323,18 @@ def graph_map(
 
 
 MARGIN = 0.15
-
 """Room around what is drawn, of its larger side."""
 
 ARROW = 0.07
-
 """Length of an arrow, of the side of its panel."""
 
 AXES_POINTS = 340.0
-
 """Side of a panel, points; labels are placed before anything is laid out."""
 
 LETTER, LINE = 5.2, 10.0
-
 """Width of a letter and height of a line of a label, points."""
 
 REACH = (13.0, 20.0, 30.0, 42.0, 56.0)
-
 """How far from its place the middle of a label may stand, points."""
 
 CANDIDATE, BRANCH = CYCLE[4], CYCLE[2]

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from taojax.detector import probability
-from taojax.risk import Calibration, Risk, lone_doubt, probability_wrong, terms
+from taojax.risk import Calibration, Risk, lone_doubt, probability, probability_wrong, terms
 
 STATUS_MEANS = {
     "ok": "",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taojax.audit import calibration, labels
-from taojax.detector import Detector, log_odds_terms, probability
+from taojax.risk import Detector, log_odds_terms, probability
 
 NAMES = ("top1_w5", "tao", "entropy", "margin", "velocity", "sue")
 ONES = np.ones(len(NAMES))

@@ -9,7 +9,7 @@ import pytest
 
 import taojax
 from taojax.audit import calibration, labels, metrics
-from taojax.audit.truth import read_truth
+from taojax.audit.labels import read_truth
 from taojax.errors import InputError
 from taojax.risk import shipped
 

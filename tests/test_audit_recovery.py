@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from taojax.audit.calibration import accepting_level
+from taojax.audit.labels import read_trials
 from taojax.audit.recovery import (
     Event,
     Outcome,
@@ -17,7 +18,6 @@ from taojax.audit.recovery import (
     reentries,
     wilson,
 )
-from taojax.audit.truth import read_trials
 from taojax.errors import InputError
 
 INF = float("inf")

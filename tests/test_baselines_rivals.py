@@ -5,8 +5,8 @@ import pytest
 from conftest import loop, motions
 
 from taojax.baselines.filters import topological, virtual_place
-from taojax.baselines.frames import Frames, clean
 from taojax.baselines.mht import MhtParams, mht
+from taojax.baselines.models import Frames, clean
 from taojax.baselines.particles import ParticleParams, particles
 from taojax.baselines.sequence import seqslam, sue
 from taojax.baselines.topometric import TopometricParams, topometric

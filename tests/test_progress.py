@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import progress as benchmark
 from taojax.audit.judgement import judge
-from taojax.audit.truth import read_truth
+from taojax.audit.labels import read_truth
 from taojax.config import AuditConfig, Config, StreamConfig
 from taojax.datasets.progress import (
     ProgressConfig,

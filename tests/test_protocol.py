@@ -9,8 +9,8 @@ from taojax.audit.evaluate import evaluate
 from taojax.audit.html import about
 from taojax.audit.report import write_summary
 from taojax.audit.summary_text import PAPER_TABLE_2, mapout_table, metric_row
-from taojax.detector import probability
 from taojax.files.tables import read_table
+from taojax.risk import probability
 
 
 @pytest.fixture(scope="module")

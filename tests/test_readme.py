@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 import taojax
 from benchmarks import __main__ as benchmarks
-from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
+from taojax.baselines.models import Frames, Track, clean, track_of_nodes
 from taojax.cli import main
 from taojax.files.specs import column_names
 from taojax.runtime.rivals import SYSTEMS

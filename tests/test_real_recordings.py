@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taojax.audit import labels, metrics
-from taojax.audit.truth import read_truth
+from taojax.audit.labels import read_truth
 from taojax.runtime.observations import load_observations
 from taojax.runtime.score import candidates
 

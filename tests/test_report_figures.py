@@ -13,8 +13,8 @@ from taojax.audit import figures as scenario_figures
 from taojax.audit import summary_text as summary
 from taojax.audit.evaluate import paste_files
 from taojax.audit.judgement import Evaluation, judge
+from taojax.audit.labels import read_truth
 from taojax.audit.summary_text import MAIN, metric_row
-from taojax.audit.truth import read_truth
 from taojax.files import records
 
 

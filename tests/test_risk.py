@@ -12,9 +12,19 @@ from taojax.audit import labels, tables
 from taojax.audit import risk as judge
 from taojax.audit.risk import Answers, Own
 from taojax.config import AuditConfig
-from taojax.detector import Detector, MapFacts, foreign_map
 from taojax.errors import InputError
-from taojax.risk import Calibration, Risk, at_most, for_run, from_toml, shipped, to_toml
+from taojax.risk import (
+    Calibration,
+    Detector,
+    MapFacts,
+    Risk,
+    at_most,
+    for_run,
+    foreign_map,
+    from_toml,
+    shipped,
+    to_toml,
+)
 from taojax.verdicts import decide, judged
 
 SEEN = MapFacts("ab12", "ef56", 2.0, 0.9)

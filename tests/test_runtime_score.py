@@ -5,10 +5,9 @@ from conftest import table, write_folder
 from judged import made_up
 
 from taojax.config import Config, StreamConfig, VerdictConfig, replace
-from taojax.detector import MapFacts
 from taojax.files import records
 from taojax.files.specs import column_names
-from taojax.risk import from_toml, shipped
+from taojax.risk import MapFacts, from_toml, shipped
 from taojax.runtime import hindsight
 from taojax.runtime.score import score
 from taojax.runtime.watch import load_map

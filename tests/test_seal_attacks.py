@@ -244,7 +244,7 @@ def test_linter_and_contracts_catch_a_baseline_that_knows_the_judge(tmp_path):
     path = tmp_path / "taojax/baselines/sequence.py"
     body = path.read_text()
     assert "import numpy as np\n" in body
-    cheat = "import numpy as np\nfrom taojax.audit.truth import read_truth\n"
+    cheat = "import numpy as np\nfrom taojax.audit.labels import read_truth\n"
     path.write_text(body.replace("import numpy as np\n", cheat, 1))
     assert test_wall.ruff_objects(tmp_path)
     assert test_wall.contracts_object(tmp_path)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from taojax.audit.labels import CalibrationSplit
-from taojax.detector import Detector, probability
+from taojax.risk import Detector, probability
 
 VIEW = ("top1", "margin", "entropy")
 """What one view tells: its best similarity, and how the list stands out (paper, section 3.3)."""

@@ -28,11 +28,9 @@ SEPARATIONS = ("auroc", "far_at_95")
 RATES = ("far", "frr")
 
 _EXACT = 1e-9
-
 """Differences below it are rounding: the tables carry nine digits."""
 
 _AGREES = 1e-6
-
 """How well metrics.csv and the frames behind it must agree."""
 
 
@@ -288,7 +286,6 @@ def compare(paths: Sequence[Path], seed: int | None = None) -> Comparison:
 
 
 FEW_EXCURSIONS = 10
-
 """Below so many excursions off the map the block bootstrap is too sure of itself."""
 
 MEASURES = {
@@ -297,11 +294,9 @@ MEASURES = {
     "far": ("FAR at the frozen threshold", "lower is better"),
     "frr": ("FRR at the frozen threshold", "lower is better"),
 }
-
 """Measure -> how people call it, and which way is up."""
 
 FINDINGS = {"better": ("#0072B2", "o"), "worse": ("#D55E00", "X")}
-
 """Finding -> colour and marker; the others are pale."""
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from taojax.audit import figures, report, tables
 from taojax.audit.graph import in_brief
 from taojax.audit.judgement import Evaluation, Judgement, judge
+from taojax.audit.labels import Truth, read_truth
 from taojax.audit.own_map import in_truth
 from taojax.audit.summary_text import MAIN, count_files, find_words, metric_row
-from taojax.audit.truth import Truth, read_truth
 from taojax.config import Config
 from taojax.files.pose_graph_io import as_verdicts
 from taojax.files.records import read_run
@@ -32,7 +32,6 @@ _COLUMNS = {
     "frr": "FRR, frozen",
     "delay_frames": "delay [frames]",
 }
-
 """Column of metrics.csv -> its heading; those with an interval print it."""
 
 

@@ -14,7 +14,6 @@ from taojax.audit.judgement import Evaluation, Judgement
 from taojax.files.specs import load_spec
 
 COMPARED = ("top1", "tao")
-
 """The gate of a single view, and ours."""
 
 
@@ -76,20 +75,16 @@ def _share_limits(axes: np.ndarray) -> None:
 
 
 TRACED = ("top1", "top1_w10", "velocity", "tao", "probability_wrong")
-
 """Signals that are drawn."""
 
 _VERDICT = {"probability_wrong": "probability_wrong"}
-
 """Those of them that stand in verdicts.csv -> their column."""
 
 
 OURS = ("probability_wrong", "tao")
-
 """Those drawn with thicker lines."""
 
 STRICT = ("top1", "velocity", "c_geom", "tao", "a_aniso")
-
 """Signals drawn under strict labels; h_proxy would lie on c_geom, of which it is a logarithm."""
 
 

@@ -12,9 +12,9 @@ from taojax.audit.html import names_of_signals
 from taojax.audit.judgement import Judgement
 from taojax.audit.risk import FINAL, NOW
 from taojax.audit.tables import FUSED
-from taojax.detector import probability
 from taojax.files.specs import load_spec
 from taojax.plots import OUTCOMES
+from taojax.risk import probability
 
 MOST_FRAMES = 10_000
 """Longer runs show every second, third, ... frame, and say so."""

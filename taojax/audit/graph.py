@@ -16,8 +16,8 @@ from taojax import plots
 from taojax.audit import figures, labels, tables
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.html import Page, grid, render
+from taojax.audit.labels import Truth, read_truth
 from taojax.audit.own_map import nearest_known
-from taojax.audit.truth import Truth, read_truth
 from taojax.config import AuditConfig
 from taojax.files.pose_graph_io import Verdicts, compose
 from taojax.files.records import Run

@@ -8,11 +8,10 @@ from jaxtyping import Float, Shaped
 
 from taojax.audit import calibration, labels, metrics, risk, tables
 from taojax.audit.conformal import Promise
-from taojax.audit.truth import Truth
+from taojax.audit.labels import Truth
 from taojax.config import Config
-from taojax.detector import Detector, probability
 from taojax.files.records import Run, map_of, signal_names
-from taojax.risk import Calibration, for_run, shipped
+from taojax.risk import Calibration, Detector, for_run, probability, shipped
 from taojax.verdicts import decide
 
 

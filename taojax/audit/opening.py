@@ -16,21 +16,17 @@ KINDS = {
     "right": "accepted, right",
     "wrong": "accepted, wrong",
 }
-
 """Kind of a test frame -> its name in the legend, in the order of drawing: wrong ones on top."""
 
 _WIDE = 1000.0
 
 _MOST_HIGH = 0.75
-
 """Height of the picture, of its width, at most: a tall map leaves room at its sides."""
 
 _FLAT = 0.4
-
 """Height of the picture, of its width, below which the numbers stand below it."""
 
 _BAR = 0.2
-
 """Length of the scale bar, of the width, at most."""
 
 
@@ -156,7 +152,6 @@ def draw_opening(judgement: Judgement) -> Drawing:
 
 
 UNKNOWN = "interval unknown"
-
 """Said where every resample gives the same number; the glossary explains it."""
 
 TOO_SHORT = "The recording is too short to hold a test split: nothing is scored out of sample."

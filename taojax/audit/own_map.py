@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.audit.truth import Truth
+from taojax.audit.labels import Truth
 from taojax.drive import known_frames
 from taojax.files.pose_graph_io import between, compose
 from taojax.files.records import Run

@@ -17,7 +17,7 @@ from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.labels import TestSplit
 from taojax.audit.summary_text import PAPER_TABLE_2, WHOLE, cut_maps, metric_row
 from taojax.audit.tables import FUSED, NAN, PROBABILITIES, Table, from_rows, operating_row
-from taojax.detector import Detector, probability
+from taojax.risk import Detector, probability
 
 COMPARED = ("top1", "velocity", "tao_rank", "tao", *PROBABILITIES)
 """Rows of a scenario: gates, Eq. 1, ours, and the fitted models."""

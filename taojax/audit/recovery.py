@@ -13,12 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from taojax.audit.calibration import accepting_level
-from taojax.audit.labels import nearest_map_distance
-from taojax.audit.truth import Trials, read_trials, read_truth
+from taojax.audit.labels import Trials, nearest_map_distance, read_trials, read_truth
 from taojax.files.records import Run, read_run
 
 Z_95 = 1.959964
-
 """Two-sided 95 % point of the normal distribution."""
 
 
@@ -239,11 +237,9 @@ def recovery_row(outcomes: Sequence[Outcome], dt_s: float) -> dict[str, Any]:
 
 
 LEAST_FRAMES = 20
-
 """A jump with fewer frames up to the end of its log is no trial."""
 
 RECORDED = "recorded"
-
 """In place of a drift level: the recording's own odometry."""
 
 

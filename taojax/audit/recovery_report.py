@@ -39,7 +39,6 @@ BELIEFS = {
     "accepted_right": Mark("right pose, accepted", IN_MAP, "o", 12),
     "accepted_wrong": Mark("wrong pose, accepted", MAP_OUT, "X", 34),
 }
-
 """What the best pose of a frame was worth -> how it is drawn; the dangerous one last, on top."""
 
 
@@ -152,7 +151,6 @@ def share_grid(
 
 
 MOST_FRAMES = 30
-
 """Length of the recovery curves: the shortest stretch."""
 
 STRONG = ("tao", "final", "now", "tao_rank")
@@ -327,7 +325,6 @@ def _noticed(row: Row) -> str:
 
 
 OURS = ("final", "now", "tao")
-
 """Methods that sentences tell of: both verdicts, and the paper's signal with joint association."""
 
 

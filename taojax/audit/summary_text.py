@@ -18,7 +18,6 @@ from taojax.files.tables import table_text
 from taojax.verdicts import plain
 
 AMONG = {"FAR": "map-out", "FRR": "in-map"}
-
 """Rate -> the test frames among which it counts."""
 
 VERDICT_FAR, VERDICT_FRR = "FAR of the verdicts", "FRR of the verdicts"
@@ -140,7 +139,6 @@ MAIN = (
     "top1", "top1_w10", "velocity", "tao_rank", "tao", "probability_wrong_now", "probability_wrong",
     "single_view", "joint_features", "fused",
 )  # fmt: skip
-
 """Signals that are told first; the others stand in the files."""
 
 _MOST = 0.5  # beyond this share a rate is called "most"
@@ -449,7 +447,6 @@ def find_words(judgement: Judgement) -> tuple[str, ...]:
 
 
 WHOLE = "full"
-
 """The scenario whose map was not cut; it carries Table 1 and the micro-scale audit."""
 
 PAPER_TABLE_1 = {
@@ -457,7 +454,6 @@ PAPER_TABLE_1 = {
     5.0: (474, 1000, 0.055, 0.311, 0.407, 0.465),
     10.0: (1000, 1000, 0.706, 0.946, 0.980, 0.999),
 }
-
 """Radius [m] -> answerable queries, queries, R@1, R@5, R@10, R@100."""
 
 PAPER_TABLE_2 = {
@@ -465,7 +461,6 @@ PAPER_TABLE_2 = {
     "h3": (253, 0.977, 0.976, 0.238, 0.049),
     "h4": (271, 0.946, 0.983, 0.326, 0.119),
 }
-
 """Scenario -> map-out frames, top-1 AUC, TAO AUC, top-1 FPR, TAO FPR."""
 
 _PAPER_COLUMNS = (

@@ -8,8 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
-from taojax.baselines.models import decay_rate, descriptor_distance
+from taojax.baselines.models import (
+    Frames,
+    Track,
+    clean,
+    decay_rate,
+    descriptor_distance,
+    track_of_nodes,
+)
 
 _TINY = 1e-30  # keeps logarithms of empty states finite in float32
 

@@ -6,8 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.baselines.frames import Frames, clean
-from taojax.baselines.models import decay_rate, descriptor_distance, median_step_m
+from taojax.baselines.models import Frames, clean, decay_rate, descriptor_distance, median_step_m
 
 _SAMPLED = 512  # nodes from which the crowding of the map is estimated
 

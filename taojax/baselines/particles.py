@@ -10,8 +10,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from taojax.baselines.frames import Frames, Track, clean
 from taojax.baselines.models import (
+    Frames,
+    Track,
+    clean,
     decay_rate,
     descriptor_distance,
     median_step_m,

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
-from taojax.baselines.models import descriptor_distance
+from taojax.baselines.models import Frames, Track, clean, descriptor_distance, track_of_nodes
 
 
 class SeqSlamParams(eqx.Module):

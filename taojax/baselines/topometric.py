@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
 from taojax.baselines.models import (
+    Frames,
+    Track,
+    clean,
     decay_rate,
     descriptor_distance,
     off_map_distance,
+    track_of_nodes,
     whitening,
 )
 

@@ -7,8 +7,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from taojax.baselines.frames import Frames, Track, clean, track_of_nodes
-from taojax.baselines.models import median_step_m
+from taojax.baselines.models import Frames, Track, clean, median_step_m, track_of_nodes
 from taojax.core.se2 import between, compose, inverse, wrap
 
 

@@ -12,7 +12,7 @@ from taojax.cli.layout import TRUTH, advice, check_folder, missing
 from taojax.errors import InputError
 
 if TYPE_CHECKING:
-    from taojax.audit.truth import Truth
+    from taojax.audit.labels import Truth
     from taojax.runtime.inspection import Found
 
 LEAST_MATCHED = 0.5
@@ -79,7 +79,7 @@ def run(args: Inspect) -> None:
 
 def _read_truth(folder: Path, found: "Found") -> "Truth | None":
     """Read the truth where there is one; what is wrong with it is a problem like any other."""
-    from taojax.audit.truth import read_truth
+    from taojax.audit.labels import read_truth
 
     path = folder / TRUTH
     if not path.exists():

@@ -24,7 +24,7 @@ from taojax.runtime.inspection import (
 )
 
 if TYPE_CHECKING:
-    from taojax.audit.truth import Truth
+    from taojax.audit.labels import Truth
     from taojax.runtime.inspection import Clock, Found, MapShape, Norms, Radii, Views
 
 
@@ -106,11 +106,9 @@ def places(
 
 
 BARELY, CLEAR = 0.04, 0.7
-
 """A recall so little above chance says that rows are mixed up; one above the other is good."""
 
 BAR = 28
-
 """Characters of the longest bar."""
 
 
@@ -249,11 +247,9 @@ def _bar(share: float) -> str:
 
 
 WINDOW = 20
-
 """Frames over which the drift of odometry is told: the default window."""
 
 NO_MOTION = float("inf")
-
 """The drift of odometry that cannot be motion from frame to frame."""
 
 UNITS = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}

@@ -63,7 +63,7 @@ def _judged(run: Path, sealed: "Run") -> "Judged | None":
     """Return labels and, where they are at hand and are those of the judge, true positions."""
     if not (run / "labels.csv").is_file():
         return None
-    from taojax.audit.truth import read_truth
+    from taojax.audit.labels import read_truth
     from taojax.cli.graph import evaluated
     from taojax.cli.rerun import data_places
     from taojax.files.pose_graph_io import refuse_foreign

@@ -45,9 +45,8 @@ class Watch(Compiling):
 def run(args: Watch) -> None:
     """Watch until stdin ends."""
     from taojax import config as settings
-    from taojax.detector import foreign_map
     from taojax.errors import ConfigError, UsageError
-    from taojax.risk import SHIPPED, for_run, from_toml, shipped
+    from taojax.risk import SHIPPED, for_run, foreign_map, from_toml, shipped
     from taojax.runtime.watch import Watch as Watcher
     from taojax.runtime.watch import load_map
 

@@ -149,28 +149,22 @@ def names_below(folder: Path, paths: Sequence[Path]) -> list[str]:
 
 
 SIDE, PLACES, DIRECTIONS, SCALES = 128, 8, 8, 3
-
 """Of GIST: pixels of the thumbnail, places along a side, and the filters."""
 
 KERNEL, SIGMA, WAVE = 13, 2.2, 4.0
-
 """Pixels of a Gabor filter, its width and its wave length; scales halve the image instead."""
 
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
 """Mean and deviation that most networks subtract and divide by."""
 
 GRAY = (0.299, 0.587, 0.114)
-
 """Weights of red, green and blue in a gray image."""
 
 DYNAMIC = 14
-
 """Sides of an input of any size are cut to multiples of this, the patch of DINOv2."""
 
 
 Describer = Callable[[Sequence[np.ndarray]], np.ndarray]
-
 """Turns prepared images into one row each."""
 
 

@@ -48,7 +48,6 @@ __all__ = [
 Segments = Sequence[tuple[float, float]]
 
 CLEARANCE_M = 20.0
-
 """A query within 10 m of a deleted stretch is then more than 10 m from every frame that stays."""
 
 SCENARIO_SEGMENTS_M: dict[str, tuple[tuple[float, float], ...]] = {
@@ -62,7 +61,6 @@ SCENARIO_SEGMENTS_M: dict[str, tuple[tuple[float, float], ...]] = {
 }
 
 SCENARIOS = tuple(SCENARIO_SEGMENTS_M)
-
 """Names of the scenarios; `full` deletes nothing."""
 
 

@@ -41,27 +41,21 @@ __all__ = [
 ]
 
 TRIAL_FRAMES = 160
-
 """Frames of a log."""
 
 WINDOW_FRAMES = 20
-
 """Frames over which the end drift of a level is stated; a jump nearer to the end is no trial."""
 
 FAR_M = 100.0
-
 """A kidnap carries the robot at least so far, metres, or ..."""
 
 FAR_SHARE = 0.25
-
 """... this share of the map's longer side, if that is less."""
 
 CALIBRATION_EVERY = 5
-
 """Every so many logs one is set apart for thresholds; its kidnaps are not counted."""
 
 PARTS = (10, 8, 6, 4)
-
 """The in-map frames are cut into so many equal runs, and calibration logs are spliced from two of
 them, half of a drive apart; fewer and longer ones where the first number leaves a side without a
 stretch that is long enough and far enough away."""
@@ -82,7 +76,6 @@ LEVELS: Mapping[str, Drift] = {
     "medium": Drift(0.07, 7.5),
     "high": Drift(0.18, 31.0),
 }
-
 """Placed about what real recordings show over 20 frames: mit_corridor 1.0 % and 0.5 degrees,
 tuc_corridor 6.9 % and 7.5 degrees, intel_lab 18.4 % and 31 degrees."""
 

@@ -80,7 +80,6 @@ DATASET = "global_descriptor"
 
 
 CACHE_BYTES = 2 << 20
-
 """HDF5 would otherwise keep 10 kB of every group it has seen."""
 
 
@@ -182,11 +181,9 @@ def _group(path: Path, held: Sequence[str], found: Sequence[int], frame: str) ->
 
 
 N_BEST = 100
-
 """Candidates kept of a dense row, the paper's K."""
 
 LARGEST = 1.0 + 1e-3
-
 """Rounding may lift a cosine so far."""
 
 FIX_SCALE = "similarities are at most 1: store cosines (1 - d^2 / 2 of unit descriptors) or rescale"

@@ -26,19 +26,15 @@ from taojax.files.tables import MOTION, read_table
 __all__ = ["OdometryKind", "odometry_at", "read_odometry", "read_wheels", "simulated"]
 
 PARAMETERS = "calibration/EncoderParameter.txt"
-
 """Where the calibration lies in a sequence folder."""
 
 FASTEST_MPS = 100.0
-
 """Wheels that turn faster say that a counter was reset or wrapped."""
 
 TURN_RAD = 1.0
-
 """The wheels must turn so far in all before they can judge the gyro."""
 
 AGREEMENT = (0.5, 2.0)
-
 """Gyro turn per wheel turn that is taken for the same turn."""
 
 # Line, least and largest value: a diameter in millimetres is outside.
@@ -143,11 +139,9 @@ def _parameters(path: Path) -> list[float]:
 OdometryKind = Literal[
     "tum", "kitti", "euroc", "g2o", "csv", "steps", "wheels", "bag", "robotcar-vo"
 ]
-
 """What holds the odometry; the first five as in `trajectories.Kind`."""
 
 LEAST_COVERED = 0.5
-
 """Odometry that covers a smaller share of the frames belongs to another drive."""
 
 

@@ -96,7 +96,6 @@ def read_kri(
 IMAGES = "img/thermal_fieldscale_clahe"
 
 LEAST_M = 2.0
-
 """GPS wanders by less, so that a heading over this distance is one."""
 
 
@@ -164,7 +163,6 @@ def _named(folder: Path) -> tuple[tuple[str, ...], Float[np.ndarray, " n"]]:
 ROBOTCAR_CAMERA = "stereo/centre"
 
 KEYS = ("timestamp", "northing", "easting", "down", "roll", "pitch", "yaw")
-
 """Columns that are used or guard those that are; a header must have them where the devkit does."""
 
 
@@ -250,11 +248,9 @@ FRAMES = {
     "mulran": ("sensor_data/Ouster", "sensor_data/radar/polar"),
     "complex_urban": ("image/stereo_left",),
 }
-
 """Where frames usually lie; the first folder that is there counts."""
 
 UNIT_LENGTH = 1e-2
-
 """Slack of a rotation's first column."""
 
 
@@ -343,11 +339,9 @@ def _mulran_frames(folder: Path, usual: Sequence[str], is_wanted: bool) -> Path 
 
 
 STHEREO_CAMERA = "stereo_thermal_14_left"
-
 """The camera of the paper; thermal images of the right one have stamps of their own."""
 
 DIGITS = 19
-
 """Of UNIX time in nanoseconds."""
 
 SENSORS = ("data_stamp", "gps", "inspva", "xsens_imu")

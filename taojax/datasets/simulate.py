@@ -37,7 +37,6 @@ __all__ = [
 ]
 
 DECIMALS = (3, 3, 3, 5)
-
 """Decimals of s, m, m and rad in every table, in memory and on disk."""
 
 _POSE_HEADER = "t_s,x_m,y_m,theta_rad"
@@ -137,7 +136,6 @@ class WorldConfig:
 
 
 NOTE = "simulated KAIST-like world: descriptors, odometry and poses are all simulated"
-
 """Travels in about.toml through the manifest into the report."""
 
 
@@ -186,7 +184,6 @@ def _write_table(path: Path, header: str, table: np.ndarray) -> None:
 
 
 CELL_M = 2.0
-
 """Spacing of every grid along the road."""
 
 _DESCRIPTOR_GRID = 2.0**14  # descriptor values are multiples of its inverse

@@ -19,7 +19,6 @@ from taojax.files.tables import is_number
 __all__ = ["COMPASS", "NAMES", "Column", "TextRows", "find_columns", "read_rows", "values_of"]
 
 COMMENTS = ("#", "%", "//")
-
 """How a line begins that is none of the table."""
 
 COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
@@ -215,19 +214,16 @@ UNITS = {
     "usec": "us", "micros": "us", "microseconds": "us", "ns": "ns", "nsec": "ns", "nsecs": "ns",
     "nanosec": "ns", "nanosecs": "ns", "nanoseconds": "ns",
 }  # fmt: skip
-
 """Words of a unit -> the unit."""
 
 KINDS = {
     "t_s": ("s", "ms", "us", "ns"), "theta_rad": ("rad", "deg"), "dtheta_rad": ("rad", "deg"),
 }  # fmt: skip
-
 """Units that a column may have; the others are lengths."""
 
 SCALE = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "rad": 1.0, "deg": np.pi / 180.0}
 
 COMPASS = ("heading", "hdg", "azimuth", "bearing", "course", "cog")
-
 """Names of headings that may count clockwise from north."""
 
 NOT_A_POSE = frozenset((
@@ -236,7 +232,6 @@ NOT_A_POSE = frozenset((
     "var", "err", "error", "bias", "imu", "cmd", "gravity", "orientation", "rotation", "quaternion",
     "quat", "orient", "rot", "q", "roll", "pitch", "ba", "bw",
 ))  # fmt: skip
-
 """Words in front of x, y, z that make it another quantity."""
 
 

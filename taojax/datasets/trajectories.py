@@ -53,11 +53,9 @@ __all__ = [
 ]
 
 CLEAR_RAD = np.deg2rad(2.0)
-
 """A reading that is nearer than this to the direction of motion is not questioned."""
 
 LEAST_CHORDS = 4
-
 """So many pieces of way are needed to say anything."""
 
 
@@ -101,11 +99,9 @@ def decided(misfits: Mapping[str, float | None]) -> str | None:
 
 
 Kind = Literal["tum", "kitti", "euroc", "g2o", "csv"]
-
 """Who wrote the file."""
 
 Where = Callable[[int], str]
-
 """Names the row, message or line that pose i comes from."""
 
 DERIVED = "headings are derived from positions"
@@ -113,27 +109,21 @@ DERIVED = "headings are derived from positions"
 NUMBERED = "no time stamps: row numbers stand for seconds"
 
 UNIT_LENGTH = 0.01
-
 """How far a quaternion may be from unit length, and a rotation matrix from orthonormal."""
 
 UPRIGHT = 0.1
-
 """A forward axis with less than this in the plane stands upright on it and has no heading."""
 
 LARGEST = 1e7
-
 """No coordinate is larger, UTM northings in metres included."""
 
 APART_M = 1.0
-
 """Poses nearer to each other than this say nothing about where forward is."""
 
 FITS_RAD = math.radians(20.0)
-
 """Headings this near to the direction of motion are headings."""
 
 SIDEWAYS_RAD = math.radians(30.0)
-
 """Headings farther than this from the direction of motion are worth a line."""
 
 _Fine = Literal["microseconds", "nanoseconds"]

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taojax.detector import MapFacts
 from taojax.errors import InputError
 from taojax.files.atomic_write import locked_part
 from taojax.files.dataset_info import DESCRIPTORS
 from taojax.files.specs import fail, load_spec, open_file, read_bytes, read_npz, write_atomically
 from taojax.files.tables import read_table, table_text
+from taojax.risk import MapFacts
 
 SCHEMA = 2
 """Of a run's manifest; 1 was taojax 0.1.0, whose runs have no delayed.csv."""

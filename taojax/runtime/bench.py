@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taojax.baselines.frames import Frames
 from taojax.baselines.mht import MhtParams, mht
+from taojax.baselines.models import Frames
 from taojax.baselines.paper_cost import numpy_cost, svd_cost
 from taojax.baselines.topometric import topometric
 from taojax.config import StreamConfig

@@ -67,7 +67,6 @@ print(time.perf_counter() - began)
 """
 
 N_IMPORTS = 3
-
 """The fastest counts: the first one also writes bytecode and fills the cache of the disk."""
 
 

@@ -38,8 +38,7 @@ from taojax.core.history import (
 )
 from taojax.core.path import Support, Window, support
 from taojax.core.se2 import between, compose, inverse, transform
-from taojax.detector import Detector
-from taojax.risk import first_look
+from taojax.risk import Detector, first_look
 from taojax.runtime.maps import MapTables, rescale
 
 LISTED = 15

@@ -61,11 +61,9 @@ SITES = (
 )
 
 STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-
 """Round numbers; times powers of ten."""
 
 PROGRESS = 2.0, 10.0
-
 """In map spacings, where positions are progress along a line, as the paper has it in rows."""
 
 
@@ -107,7 +105,6 @@ def _round_up(least: float) -> float:
 
 
 N_QUERIES, N_PAIRS = 1000, 64
-
 """Queries whose best match is looked up; rows of each side that pair with one another."""
 
 
@@ -280,25 +277,20 @@ def _shape(array: np.ndarray) -> str:
 
 
 UNIX = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
-
 """Unit -> the least UNIX time in it that is later than the seventies."""
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 SPEEDS_MPS = 0.02, 60.0
-
 """What robots and cars drive at."""
 
 ROW_STEP = 10.0
-
 """Whole numbers with smaller steps count rows, of which some may have been left out."""
 
 GAP_SPACINGS = 5.0
-
 """A step of the map longer than so many spacings is a gap."""
 
 REVISIT_SPACINGS, REVISIT_WAY = 3.0, 10.0
-
 """A place is met again within so many spacings of another, so many times as far along the way."""
 
 

@@ -11,37 +11,30 @@ from scipy.spatial import KDTree
 from taojax.config import StreamConfig
 from taojax.core.anchors import AnchorGrid
 from taojax.core.belief import Places
-from taojax.detector import LIST_RECALL
 from taojax.errors import InputError
+from taojax.risk import LIST_RECALL
 from taojax.runtime.retrieval import normalise, similarities
 
 LIST_SCALE = (0.0, 1.0)
-
 """Background and strong similarity of retrieval lists without map descriptors."""
 
 STRONG_QUANTILE = 0.75
-
 """Of the map images' best other map image."""
 
 BACKGROUND_SHARE, STRONG_SHARE = 0.7, 0.9
-
 """Another session resembles the map less than the map itself does: both ends of the scale are drawn
 by so much from the map's mean similarity."""
 
 LEAST_RANGE = 0.02
-
 """Strong match and background never count as closer than this."""
 
 BACKGROUND_RANK = 100
-
 """The background is the similarity of the 100th best image, the paper's K."""
 
 NEAR_SPACINGS = 9.0
-
 """An image within so many map spacings shows the same place."""
 
 SAMPLE = 512
-
 """Map images that vote on the scale, evenly spaced."""
 
 
@@ -143,37 +136,29 @@ def _spread_rows(xy: np.ndarray) -> np.ndarray:
 
 
 NEIGHBOURS = 12
-
 """Anchors that mass spreads to from each anchor."""
 
 ON_EDGES = 0.1
-
 """Share of anchors that one corner must serve better than the other to be preferred."""
 
 PLACES_REACH = 4.0
-
 """A cell of the filter's grid knows an anchor within so many gaps: twice as far as a transition
 may come from."""
 
 IN_ORDER = 0.25
-
 """Rows whose median step is longer than so much of the map's extent are in no driving order: of
 shuffled rows it is about the extent itself, of a drive of twenty images a twentieth of it."""
 
 LEAST_ROWS = 20
-
 """Maps of fewer rows are taken to be in driving order."""
 
 MOST_UNIT = 4.0
-
 """A whole piece of evidence takes at most so many gaps of way, however slowly the map changes."""
 
 MAX_CELLS = 1500
-
 """Cells along the longer side at most; a larger map gets coarser cells, not more memory."""
 
 LEAST_CELLS, CELLS_GROWTH = 16_384, 2
-
 """Cells that a grid is padded to: so many, and so many times as many as that does not suffice. Maps
 of as many rows share compiled programs."""
 

@@ -7,8 +7,8 @@ import numpy as np
 from tqdm import tqdm
 
 from taojax.baselines.filters import topological, virtual_place
-from taojax.baselines.frames import Frames
 from taojax.baselines.mht import mht
+from taojax.baselines.models import Frames
 from taojax.baselines.particles import ParticleParams, particles
 from taojax.baselines.sequence import seqslam, sue
 from taojax.baselines.topometric import TopometricParams, topometric

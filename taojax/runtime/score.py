@@ -15,11 +15,10 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, StreamConfig, replace, to_toml
-from taojax.detector import foreign_map
 from taojax.errors import InputError
 from taojax.files.records import SealedTrack, code_digest, map_of, refuse_if_taken, write_run
 from taojax.files.specs import read_bytes
-from taojax.risk import SHIPPED, Calibration, for_run, shipped
+from taojax.risk import SHIPPED, Calibration, for_run, foreign_map, shipped
 from taojax.risk import to_toml as calibration_toml
 from taojax.runtime import growing, hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
@@ -32,7 +31,6 @@ from taojax.runtime.stream import COMPILING, answered, init, literal, replay
 from taojax.verdicts import decide
 
 SAME = 1e-4
-
 """Costs nearer than this, relatively, differ by rounding alone."""
 
 
@@ -63,7 +61,6 @@ def check_refinement(
 
 
 CHUNK_TRIALS = 32
-
 """Trials per call and device; one compilation, and a progress bar that moves."""
 
 
@@ -141,7 +138,6 @@ def replay_trials(
 
 
 CHUNK_FRAMES = 256
-
 """Frames per scan; one compilation, and a progress bar that moves."""
 
 

@@ -32,13 +32,11 @@ from taojax.runtime.frames import (
 from taojax.runtime.maps import MapTables
 
 WINDOWS = (5, 10, 20)
-
 """Lengths of the windowed top-1 signals, frames."""
 
 SUE_CANDIDATES = 10
 
 SUE_SHARPNESS = 20.0
-
 """Weights of the spatial spread: softmax(20 s) over the top 10."""
 
 
@@ -119,11 +117,9 @@ def sue(
 
 
 WARM_FRAMES = 3
-
 """Frames seen before anything is said of a place."""
 
 COMPILING = "compiling once"
-
 """On a bar until the first frames are done, some 5 to 20 s: one that stands still alarms."""
 
 

@@ -44,17 +44,14 @@ JOINT = (
 )  # fmt: skip
 
 SETTINGS = {"rank": RANK, "joint": JOINT}
-
 """Association -> the settings that its signal depends on; the others would only repeat rows."""
 
 COLUMNS = tuple(dict.fromkeys(RANK + JOINT))
 
 Grid = Mapping[str, Mapping[str, tuple[float | int | bool, ...]]]
-
 """Association -> setting -> values; a setting left out keeps the configuration's value."""
 
 Row = dict[str, float | int | str | bool]
-
 """One configuration: association, its settings, is_default, is_in_grid."""
 
 DEFAULT: Grid = {
@@ -73,11 +70,9 @@ DEFAULT: Grid = {
         "near_gaps": (1.0, 2.0),
     },
 }
-
 """256 rank configurations around the paper's, and 36 of the filter; the defaults are among them."""
 
 MOST = 100_000
-
 """Configurations of one sweep at most."""
 
 
@@ -235,11 +230,9 @@ def largest(rows: Sequence[Row], name: str) -> int:
 
 
 MOST_AT_ONCE = 32
-
 """Units under one `vmap` at most, where vmap is used at all."""
 
 MEMORY_BYTES = 1 << 30
-
 """Tables and rings of the units under one `vmap` may take so much."""
 
 
@@ -451,7 +444,6 @@ def plan(
 
 
 PARTS = "parts"
-
 """Folder of finished parts inside an unfinished sweep."""
 
 Stage = Literal["new", "begun", "sealed"]

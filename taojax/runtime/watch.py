@@ -18,13 +18,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.config import Config, StreamConfig
-from taojax.detector import MapFacts
 from taojax.errors import InputError
 from taojax.files.dataset_info import DESCRIPTORS
 from taojax.files.records import digest_file
 from taojax.files.specs import read_npy
 from taojax.files.tables import POSE, read_table, stacked
-from taojax.risk import Calibration, shipped
+from taojax.risk import Calibration, MapFacts, shipped
 from taojax.runtime import hindsight
 from taojax.runtime.frames import STATUSES, Frame, StreamRecord
 from taojax.runtime.maps import MapTables, map_tables
