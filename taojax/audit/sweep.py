@@ -1,4 +1,4 @@
-"""Judge a sealed sweep: choose on the calibration half, open the test half for the choice, draw both."""
+"""Judge a sealed sweep: choose on the calibration half, open the test half for it, draw both."""
 
 import itertools
 import json
