@@ -123,7 +123,7 @@ def test_the_signal_of_the_guide_is_one_and_goes_where_the_guide_says():
     stands_out, flat = jnp.array([0.9, 0.1, 0.1]), jnp.array([0.5, 0.5, 0.5])
     assert float(names["contrast"](stands_out)) < float(names["contrast"](flat)) <= 0.0
     assert "margin" in column_names("signals")
-    assert '"margin": signals.margin(similarity),' in (ROOT / "taojax/runtime/stream.py").read_text(
+    assert '"margin": margin(similarity),' in (ROOT / "taojax/runtime/stream.py").read_text(
         encoding="utf-8"
     )
 

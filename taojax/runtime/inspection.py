@@ -43,239 +43,6 @@ __all__ = [
 ]
 
 
-class Site(NamedTuple):
-    """A kind of place and the radii that are usual there [m]."""
-
-    name: str
-    below_m: float
-    """Longer side of its map."""
-
-    r_in_m: float
-    r_out_m: float
-
-
-SITES = (
-    Site("rooms", 40.0, 1.5, 3.0),
-    Site("a corridor or yard", 300.0, 5.0, 10.0),
-    Site("a street", math.inf, 10.0, 10.0),
-)
-
-STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""Round numbers; times powers of ten."""
-
-PROGRESS = 2.0, 10.0
-"""In map spacings, where positions are progress along a line, as the paper has it in rows."""
-
-
-class Radii(NamedTuple):
-    """What to hand to `--r-in` and `--r-out` [m], and why."""
-
-    r_in_m: float
-    r_out_m: float
-    why: str
-
-
-def suggest_radii(shape: MapShape, stray_m: float | None = None) -> Radii:
-    """Propose radii for a map.
-
-    Args:
-        shape: of the map.
-        stray_m: drift of the odometry, where it is known: no closure is placed better than
-            that, nor better than the map is dense.
-    """
-    if min(shape.size_m) == 0.0 and max(shape.size_m) > 0.0:
-        r_in_m, r_out_m = (_round_up(times * shape.spacing_m) for times in PROGRESS)
-        return Radii(r_in_m, r_out_m, "positions along a line: 2 and 10 map spacings")
-    long_m = max(shape.size_m)
-    site = next(site for site in SITES if long_m < site.below_m)
-    why = f"a map of {long_m:.0f} m is taken for {site.name}"
-    floors = {"the map's spacing": shape.spacing_m, "the drift of odometry": stray_m or 0.0}
-    name = max(floors, key=floors.__getitem__)
-    if (least_m := floors[name]) <= site.r_in_m:
-        return Radii(site.r_in_m, site.r_out_m, why)
-    r_in_m = _round_up(least_m)
-    r_out_m = max(r_in_m, min(2.0 * r_in_m, SITES[-1].r_out_m))
-    return Radii(r_in_m, r_out_m, f"{why}, raised to {name}")
-
-
-def _round_up(least: float) -> float:
-    """Return the next round number."""
-    power = 10.0 ** math.floor(math.log10(least))
-    return next((s * power for s in STEPS if s * power >= least * (1 - 1e-6)), 10.0 * power)
-
-
-N_QUERIES, N_PAIRS = 1000, 64
-"""Queries whose best match is looked up; rows of each side that pair with one another."""
-
-
-@dataclass(frozen=True)
-class Views:
-    """How alike the two sessions look."""
-
-    rows: Int[np.ndarray, " q"]
-    """Queries looked at."""
-
-    best: Int[np.ndarray, " q"]
-    """Map row of the best match of each, -1 = none."""
-
-    best_similarity: Float[np.ndarray, " q"]
-    others: Float[np.ndarray, " p"]
-    """Similarities of random pairs; of lists, those of all candidates behind the best."""
-
-    own_recall: float | None
-    """Share of map images whose most similar other image lies nearby; None for lists."""
-
-
-def views(observations: Observations, xy: Float[np.ndarray, "m 2"], spacing_m: float) -> Views:
-    """Look at best matches, random pairs and the map's likeness to itself.
-
-    Args:
-        observations: a folder in which nothing is wrong.
-        xy: (M, 2) map positions [m].
-        spacing_m: of the map.
-    """
-    if observations.retrievals is not None:
-        index, similarity = observations.retrievals.index, observations.retrievals.similarity
-        rows = np.flatnonzero(index[:, 0] >= 0)
-        others = similarity[:, 1:][index[:, 1:] >= 0]
-        return Views(rows, index[rows, 0], similarity[rows, 0], others, None)
-    of_map, of_query = observations.descriptors or (np.zeros((0, 0)), np.zeros((0, 0)))
-    rows = _spread(len(of_query), N_QUERIES)
-    index, similarity = retrieve(of_map, of_query[rows], 1)
-    pairs = [normalise(side[_spread(len(side), N_PAIRS)]) for side in (of_query, of_map)]
-    recall = view_map(of_map, xy, spacing_m).recall
-    return Views(rows, index[:, 0], similarity[:, 0], (pairs[0] @ pairs[1].T).ravel(), recall)
-
-
-def _spread(n: int, n_kept: int) -> Int[np.ndarray, " k"]:
-    return np.unique(np.linspace(0, n - 1, min(n, n_kept)).astype(int))
-
-
-def near_m(spacing_m: float) -> float:
-    """Return the radius within which the runtime takes two map images for one place [m]."""
-    return NEAR_SPACINGS * spacing_m
-
-
-def chance(map_xy: Float[np.ndarray, "m 2"], reach_m: float) -> float:
-    """Return the share of other map images within a radius of one: what blind guessing hits."""
-    rows = _spread(len(map_xy), 512)
-    gap = map_xy[rows][:, None] - map_xy[None]
-    return float((np.sum(gap**2, axis=2) <= reach_m**2).sum(axis=1).mean() - 1) / len(map_xy)
-
-
-def histogram(
-    a: Float[np.ndarray, " p"], b: Float[np.ndarray, " q"], n_bins: int = 12
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return common edges and the share of each sample in every bin."""
-    low, high = (float(end(np.concatenate([a, b]))) for end in (np.min, np.max))
-    edges = np.linspace(low, max(high, low + 1e-6), n_bins + 1)
-    shares = [np.histogram(x, edges)[0] / max(1, len(x)) for x in (a, b)]
-    return edges, shares[0], shares[1]
-
-
-T = TypeVar("T")
-
-
-@dataclass
-class Found:
-    """A data folder as far as it can be read; None is what cannot."""
-
-    files: dict[str, str] = field(default_factory=dict)
-    """Name -> what it holds; blank where it cannot be read."""
-
-    problems: dict[str, str] = field(default_factory=dict)
-    """Name -> the one line on what is wrong with it."""
-
-    map_t: np.ndarray | None = None
-    map_xyt: np.ndarray | None = None
-    """(M, 3)."""
-
-    query_t: np.ndarray | None = None
-    odometry: np.ndarray | None = None
-    """(T, 3)."""
-
-    norms: dict[str, Norms] = field(default_factory=dict)
-    """Of each file of descriptors."""
-
-    observations: Observations | None = None
-    """All of it, where nothing is wrong."""
-
-    def attempt(self, name: str, read: Callable[[], T]) -> T | None:
-        """Read a file, or note what is wrong with it."""
-        try:
-            return read()
-        except InputError as error:
-            self.files.setdefault(name, "")
-            self.problems.setdefault(name, str(error))
-            return None
-
-
-def check(folder: Path) -> Found:
-    """Read every file of a data folder but the truth.
-
-    Args:
-        folder: laid out as data_specs/README.md says.
-
-    Raises:
-        InputError: there is no such folder.
-    """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such data folder; see data_specs/README.md for the layout")
-    found = Found()
-    found.map_t, found.map_xyt = _table(found, folder, "map/poses.csv", "map_poses")
-    found.query_t, found.odometry = _table(found, folder, "query/odometry.csv", "query_odometry")
-    if (folder / "query/retrievals.npz").exists():
-        _lists(found, folder, "query/retrievals.npz")
-    else:
-        names = found.attempt("descriptors", lambda: descriptor_names(folder)) or ()
-        for name, stamps in zip(names, (found.map_t, found.query_t), strict=False):
-            _descriptors(found, folder, name, stamps)
-    if (folder / "about.toml").exists():
-        found.files["about.toml"] = "notes"
-        n_query = None if found.query_t is None else len(found.query_t)
-        found.attempt("about.toml", lambda: read_about(folder, n_query))
-    try:
-        found.observations = load_observations(folder)
-    except InputError as error:
-        # It stops at the first; what is new goes to the file that it names.
-        own = (name for name in found.files if str(error).startswith(f"{folder / name}:"))
-        found.problems.setdefault(next(own, "descriptors"), str(error))
-    return found
-
-
-def _table(
-    found: Found, folder: Path, name: str, spec: str
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return stamps and the three other columns."""
-    table = found.attempt(name, lambda: read_table(folder / name, spec))
-    if table is None:
-        return None, None
-    found.files[name] = f"{len(table['t_s']):,} rows"
-    return table["t_s"], np.stack([table[column] for column in list(table)[1:]], axis=1)
-
-
-def _lists(found: Found, folder: Path, name: str) -> None:
-    arrays = found.attempt(name, lambda: read_npz(folder / name, "retrievals"))
-    if arrays is not None:
-        found.files[name] = f"{_shape(arrays['index'])} candidates"
-
-
-def _descriptors(found: Found, folder: Path, name: str, stamps: np.ndarray | None) -> None:
-    array = found.attempt(name, lambda: read_npy(folder / name, "descriptors"))
-    if array is None:
-        return
-    found.files[name] = f"{_shape(array)} {array.dtype}"
-    if stamps is not None and len(array) != len(stamps):
-        what = f"{len(array)} rows for {len(stamps)} frames"
-        found.problems[name] = str(fail(folder / name, what, "store one row per frame"))
-    measured = found.attempt(name, lambda: norms(array, str(folder / name)))
-    found.norms |= {} if measured is None else {name: measured}
-
-
-def _shape(array: np.ndarray) -> str:
-    return " x ".join(f"{n:,}" for n in array.shape)
-
-
 UNIX = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 """Unit -> the least UNIX time in it that is later than the seventies."""
 
@@ -509,3 +276,236 @@ def steps(odometry: Float[np.ndarray, "t 3"]) -> Steps:
         sideways=float(np.abs(moved[:, 1]).sum() / max(np.abs(moved[:, :2]).sum(), 1e-9)),
         largest_yaw_rad=float(np.abs(moved[:, 2]).max()),
     )
+
+
+class Site(NamedTuple):
+    """A kind of place and the radii that are usual there [m]."""
+
+    name: str
+    below_m: float
+    """Longer side of its map."""
+
+    r_in_m: float
+    r_out_m: float
+
+
+SITES = (
+    Site("rooms", 40.0, 1.5, 3.0),
+    Site("a corridor or yard", 300.0, 5.0, 10.0),
+    Site("a street", math.inf, 10.0, 10.0),
+)
+
+STEPS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Round numbers; times powers of ten."""
+
+PROGRESS = 2.0, 10.0
+"""In map spacings, where positions are progress along a line, as the paper has it in rows."""
+
+
+class Radii(NamedTuple):
+    """What to hand to `--r-in` and `--r-out` [m], and why."""
+
+    r_in_m: float
+    r_out_m: float
+    why: str
+
+
+def suggest_radii(shape: MapShape, stray_m: float | None = None) -> Radii:
+    """Propose radii for a map.
+
+    Args:
+        shape: of the map.
+        stray_m: drift of the odometry, where it is known: no closure is placed better than
+            that, nor better than the map is dense.
+    """
+    if min(shape.size_m) == 0.0 and max(shape.size_m) > 0.0:
+        r_in_m, r_out_m = (_round_up(times * shape.spacing_m) for times in PROGRESS)
+        return Radii(r_in_m, r_out_m, "positions along a line: 2 and 10 map spacings")
+    long_m = max(shape.size_m)
+    site = next(site for site in SITES if long_m < site.below_m)
+    why = f"a map of {long_m:.0f} m is taken for {site.name}"
+    floors = {"the map's spacing": shape.spacing_m, "the drift of odometry": stray_m or 0.0}
+    name = max(floors, key=floors.__getitem__)
+    if (least_m := floors[name]) <= site.r_in_m:
+        return Radii(site.r_in_m, site.r_out_m, why)
+    r_in_m = _round_up(least_m)
+    r_out_m = max(r_in_m, min(2.0 * r_in_m, SITES[-1].r_out_m))
+    return Radii(r_in_m, r_out_m, f"{why}, raised to {name}")
+
+
+def _round_up(least: float) -> float:
+    """Return the next round number."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next((s * power for s in STEPS if s * power >= least * (1 - 1e-6)), 10.0 * power)
+
+
+N_QUERIES, N_PAIRS = 1000, 64
+"""Queries whose best match is looked up; rows of each side that pair with one another."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """How alike the two sessions look."""
+
+    rows: Int[np.ndarray, " q"]
+    """Queries looked at."""
+
+    best: Int[np.ndarray, " q"]
+    """Map row of the best match of each, -1 = none."""
+
+    best_similarity: Float[np.ndarray, " q"]
+    others: Float[np.ndarray, " p"]
+    """Similarities of random pairs; of lists, those of all candidates behind the best."""
+
+    own_recall: float | None
+    """Share of map images whose most similar other image lies nearby; None for lists."""
+
+
+def views(observations: Observations, xy: Float[np.ndarray, "m 2"], spacing_m: float) -> Views:
+    """Look at best matches, random pairs and the map's likeness to itself.
+
+    Args:
+        observations: a folder in which nothing is wrong.
+        xy: (M, 2) map positions [m].
+        spacing_m: of the map.
+    """
+    if observations.retrievals is not None:
+        index, similarity = observations.retrievals.index, observations.retrievals.similarity
+        rows = np.flatnonzero(index[:, 0] >= 0)
+        others = similarity[:, 1:][index[:, 1:] >= 0]
+        return Views(rows, index[rows, 0], similarity[rows, 0], others, None)
+    of_map, of_query = observations.descriptors or (np.zeros((0, 0)), np.zeros((0, 0)))
+    rows = _spread(len(of_query), N_QUERIES)
+    index, similarity = retrieve(of_map, of_query[rows], 1)
+    pairs = [normalise(side[_spread(len(side), N_PAIRS)]) for side in (of_query, of_map)]
+    recall = view_map(of_map, xy, spacing_m).recall
+    return Views(rows, index[:, 0], similarity[:, 0], (pairs[0] @ pairs[1].T).ravel(), recall)
+
+
+def _spread(n: int, n_kept: int) -> Int[np.ndarray, " k"]:
+    return np.unique(np.linspace(0, n - 1, min(n, n_kept)).astype(int))
+
+
+def near_m(spacing_m: float) -> float:
+    """Return the radius within which the runtime takes two map images for one place [m]."""
+    return NEAR_SPACINGS * spacing_m
+
+
+def chance(map_xy: Float[np.ndarray, "m 2"], reach_m: float) -> float:
+    """Return the share of other map images within a radius of one: what blind guessing hits."""
+    rows = _spread(len(map_xy), 512)
+    gap = map_xy[rows][:, None] - map_xy[None]
+    return float((np.sum(gap**2, axis=2) <= reach_m**2).sum(axis=1).mean() - 1) / len(map_xy)
+
+
+def histogram(
+    a: Float[np.ndarray, " p"], b: Float[np.ndarray, " q"], n_bins: int = 12
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return common edges and the share of each sample in every bin."""
+    low, high = (float(end(np.concatenate([a, b]))) for end in (np.min, np.max))
+    edges = np.linspace(low, max(high, low + 1e-6), n_bins + 1)
+    shares = [np.histogram(x, edges)[0] / max(1, len(x)) for x in (a, b)]
+    return edges, shares[0], shares[1]
+
+
+T = TypeVar("T")
+
+
+@dataclass
+class Found:
+    """A data folder as far as it can be read; None is what cannot."""
+
+    files: dict[str, str] = field(default_factory=dict)
+    """Name -> what it holds; blank where it cannot be read."""
+
+    problems: dict[str, str] = field(default_factory=dict)
+    """Name -> the one line on what is wrong with it."""
+
+    map_t: np.ndarray | None = None
+    map_xyt: np.ndarray | None = None
+    """(M, 3)."""
+
+    query_t: np.ndarray | None = None
+    odometry: np.ndarray | None = None
+    """(T, 3)."""
+
+    norms: dict[str, Norms] = field(default_factory=dict)
+    """Of each file of descriptors."""
+
+    observations: Observations | None = None
+    """All of it, where nothing is wrong."""
+
+    def attempt(self, name: str, read: Callable[[], T]) -> T | None:
+        """Read a file, or note what is wrong with it."""
+        try:
+            return read()
+        except InputError as error:
+            self.files.setdefault(name, "")
+            self.problems.setdefault(name, str(error))
+            return None
+
+
+def check(folder: Path) -> Found:
+    """Read every file of a data folder but the truth.
+
+    Args:
+        folder: laid out as data_specs/README.md says.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such data folder; see data_specs/README.md for the layout")
+    found = Found()
+    found.map_t, found.map_xyt = _table(found, folder, "map/poses.csv", "map_poses")
+    found.query_t, found.odometry = _table(found, folder, "query/odometry.csv", "query_odometry")
+    if (folder / "query/retrievals.npz").exists():
+        _lists(found, folder, "query/retrievals.npz")
+    else:
+        names = found.attempt("descriptors", lambda: descriptor_names(folder)) or ()
+        for name, stamps in zip(names, (found.map_t, found.query_t), strict=False):
+            _descriptors(found, folder, name, stamps)
+    if (folder / "about.toml").exists():
+        found.files["about.toml"] = "notes"
+        n_query = None if found.query_t is None else len(found.query_t)
+        found.attempt("about.toml", lambda: read_about(folder, n_query))
+    try:
+        found.observations = load_observations(folder)
+    except InputError as error:
+        # It stops at the first; what is new goes to the file that it names.
+        own = (name for name in found.files if str(error).startswith(f"{folder / name}:"))
+        found.problems.setdefault(next(own, "descriptors"), str(error))
+    return found
+
+
+def _table(
+    found: Found, folder: Path, name: str, spec: str
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return stamps and the three other columns."""
+    table = found.attempt(name, lambda: read_table(folder / name, spec))
+    if table is None:
+        return None, None
+    found.files[name] = f"{len(table['t_s']):,} rows"
+    return table["t_s"], np.stack([table[column] for column in list(table)[1:]], axis=1)
+
+
+def _lists(found: Found, folder: Path, name: str) -> None:
+    arrays = found.attempt(name, lambda: read_npz(folder / name, "retrievals"))
+    if arrays is not None:
+        found.files[name] = f"{_shape(arrays['index'])} candidates"
+
+
+def _descriptors(found: Found, folder: Path, name: str, stamps: np.ndarray | None) -> None:
+    array = found.attempt(name, lambda: read_npy(folder / name, "descriptors"))
+    if array is None:
+        return
+    found.files[name] = f"{_shape(array)} {array.dtype}"
+    if stamps is not None and len(array) != len(stamps):
+        what = f"{len(array)} rows for {len(stamps)} frames"
+        found.problems[name] = str(fail(folder / name, what, "store one row per frame"))
+    measured = found.attempt(name, lambda: norms(array, str(folder / name)))
+    found.norms |= {} if measured is None else {name: measured}
+
+
+def _shape(array: np.ndarray) -> str:
+    return " x ".join(f"{n:,}" for n in array.shape)
