@@ -13,7 +13,6 @@ from benchmarks.entrants import FITTED, GATES, ORACLES, Entry, Field, compete
 from benchmarks.pictures import save
 from benchmarks.sets import DataSet, Recipe, recipes
 from taojax.audit import calibration, metrics, risk, tables
-from taojax.audit import metrics as bootstrap
 from taojax.audit.labels import CalibrationSplit
 from taojax.config import AuditConfig, Config
 
@@ -39,13 +38,13 @@ def _separation(
     """Return AUROC and FAR@95 with intervals, and the AUROC of every resample."""
     if np.isnan(signal).any() or is_out.all() or not is_out.any():
         return {}, np.full(len(weights), NAN)
-    drawn = bootstrap.weighted_separation(signal, is_out, weights)
+    drawn = metrics.weighted_separation(signal, is_out, weights)
     row: Row = {}
     points = metrics.auroc(signal, is_out), metrics.far_at_95(signal, is_out)
     for name, point, samples in zip(
         ("auroc", "far_at_95"), points, (drawn.auroc, drawn.far_at_95), strict=True
     ):
-        low, high = bootstrap.interval(samples)
+        low, high = metrics.interval(samples)
         row |= {f"{name}{suffix}": point}
         row |= {f"{name}{suffix}_lo": low, f"{name}{suffix}_hi": high}
     return row, drawn.auroc
@@ -125,7 +124,7 @@ def leaderboard(
     known, entries = compete(data, config, quick=quick, names=names)
     n_test = len(known.split({}).test.frame)
     draws = [
-        bootstrap.block_weights(n, audit.block_frames, audit.n_bootstrap, config.seed)
+        metrics.block_weights(n, audit.block_frames, audit.n_bootstrap, config.seed)
         for n in (len(known.label), n_test)
     ]
     judged = [_judge(data, entry, known, audit, draws) for entry in entries]
@@ -135,7 +134,7 @@ def leaderboard(
         for one in judged:
             if "auroc_test" not in one.row:
                 continue
-            low, high = bootstrap.interval(one.drawn - best.drawn)
+            low, high = metrics.interval(one.drawn - best.drawn)
             one.row["rival"] = best.row["entrant"]
             one.row["auroc_minus_rival"] = one.row["auroc_test"] - best.row["auroc_test"]
             one.row.update(auroc_minus_rival_lo=low, auroc_minus_rival_hi=high)

@@ -1,7 +1,6 @@
 """What is attacked: readers of other people's recordings."""
 
 import functools
-import importlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -20,18 +19,18 @@ from benchmarks.reliability_targets import (
     from_tests,
     write_data,
 )
+from taojax.datasets import public_sets
 
 
 def _sessions(name: str, folder: Path, out: Path, **more: Any) -> list[np.ndarray]:
-    module, function = {
-        "sthereo": ("sthereo", "read_sthereo"),
-        "mulran": ("mulran", "read_mulran"),
-        "complex-urban": ("mulran", "read_complex_urban"),
-        "robotcar": ("robotcar", "read_robotcar"),
-        "vivid": ("vivid", "read_vivid"),
-        "kri": ("kri", "read_kri"),
+    read = {
+        "sthereo": public_sets.read_sthereo,
+        "mulran": public_sets.read_mulran,
+        "complex-urban": public_sets.read_complex_urban,
+        "robotcar": public_sets.read_robotcar,
+        "vivid": public_sets.read_vivid,
+        "kri": public_sets.read_kri,
     }[name]
-    read = getattr(importlib.import_module(f"taojax.datasets.{module}"), function)
     session = read(folder / "query", **more)
     return [session.poses.t_s, session.poses.xyt]
 

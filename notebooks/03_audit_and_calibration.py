@@ -22,8 +22,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from taojax import Config, Frame, map_tables
-from taojax import risk as detector
+from taojax import Config, Frame, map_tables, risk
 from taojax.audit import calibration, labels, metrics
 from taojax.datasets.edit import scenario
 from taojax.datasets.simulate import WorldConfig, make_world
@@ -69,7 +68,7 @@ print(f"top-1 at mean + 3 sigma: {gate:.0%} of the map-out test frames accepted"
 # %%
 model = calibration.fit(splits.calibration, shipped().map_out)
 print(model.note)
-p = detector.probability(model, test.signals)
+p = risk.probability(model, test.signals)
 far = float((p[test.is_out] <= model.threshold).mean())
 frr = float((p[test.is_in] > model.threshold).mean())
 known = test.is_in | test.is_out

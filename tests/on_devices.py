@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from taojax.config import Config, StreamConfig
-from taojax.runtime import retrieval
-from taojax.runtime import score as trials
+from taojax.runtime import retrieval, score
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 
@@ -52,7 +51,7 @@ def found(folder):
 
 def replayed():
     """Replay more trials than one call takes."""
-    usual, trials.CHUNK_TRIALS = trials.CHUNK_TRIALS, 1
+    usual, score.CHUNK_TRIALS = score.CHUNK_TRIALS, 1
     config = Config(stream=StreamConfig(window=6, branches=5, association="rank"))
     rng = np.random.default_rng(7)
     n = N_TRIALS * LENGTH
@@ -63,8 +62,8 @@ def replayed():
     )
     poses = np.c_[np.cumsum(rng.uniform(0.5, 1.5, 30)), np.zeros((30, 2))]
     tables = map_tables(poses, config.stream)
-    records = trials.replay_trials(config, tables, trials.in_trials(frames, LENGTH))
-    trials.CHUNK_TRIALS = usual
+    records = score.replay_trials(config, tables, score.in_trials(frames, LENGTH))
+    score.CHUNK_TRIALS = usual
     leaves = jax.tree_util.tree_leaves_with_path(records)
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 

@@ -6,7 +6,7 @@ import judged
 import numpy as np
 import pytest
 
-from taojax.audit import summary_text as counts
+from taojax.audit import summary_text
 from taojax.audit.summary_text import find_words, metric_row
 from taojax.files.tables import read_table
 
@@ -17,7 +17,7 @@ def case(tmp_path_factory):
 
 
 def rows_of(judgement):
-    table = counts.counts_table(judgement)
+    table = summary_text.counts_table(judgement)
     names = ("in_map", "map_out", "grey", "frames")
     return {
         str(name): dict(zip(names, values, strict=True))
@@ -44,17 +44,20 @@ def test_rows_and_columns_add_up_to_all_frames(case):
 
 def test_each_rate_counts_rows_of_the_table(case):
     judgement = case[1].judgement
-    rows, rates = rows_of(judgement), counts.rates_of(judgement)
+    rows, rates = rows_of(judgement), summary_text.rates_of(judgement)
     test = judgement.splits.test
     above = judgement.verdicts["probability_map_out"][test.frame] > judgement.detector.threshold
-    alone = {counts.THRESHOLD_FAR: ~above & test.is_out, counts.THRESHOLD_FRR: above & test.is_in}
+    alone = {
+        summary_text.THRESHOLD_FAR: ~above & test.is_out,
+        summary_text.THRESHOLD_FRR: above & test.is_in,
+    }
     for name, kind, column in (
-        (counts.VERDICT_FAR, "accepted", "map_out"),
-        (counts.THRESHOLD_FAR, None, "map_out"),
-        (counts.LEFT_OUT, "abstained", "map_out"),
-        (counts.VERDICT_FRR, "rejected", "in_map"),
-        (counts.THRESHOLD_FRR, None, "in_map"),
-        (counts.LEFT_IN, "abstained", "in_map"),
+        (summary_text.VERDICT_FAR, "accepted", "map_out"),
+        (summary_text.THRESHOLD_FAR, None, "map_out"),
+        (summary_text.LEFT_OUT, "abstained", "map_out"),
+        (summary_text.VERDICT_FRR, "rejected", "in_map"),
+        (summary_text.THRESHOLD_FRR, None, "in_map"),
+        (summary_text.LEFT_IN, "abstained", "in_map"),
     ):
         rate = rates[name]
         assert rate["n"] == (rows[kind][column] if kind else alone[name].sum()), name
@@ -65,8 +68,8 @@ def test_each_rate_counts_rows_of_the_table(case):
 
 def test_the_rates_at_the_threshold_are_those_of_metrics_csv(case):
     judgement = case[1].judgement
-    row, rates = metric_row(judgement, "fused"), counts.rates_of(judgement)
-    for name, column in ((counts.THRESHOLD_FAR, "far"), (counts.THRESHOLD_FRR, "frr")):
+    row, rates = metric_row(judgement, "fused"), summary_text.rates_of(judgement)
+    for name, column in ((summary_text.THRESHOLD_FAR, "far"), (summary_text.THRESHOLD_FRR, "frr")):
         for end in ("", "_lo", "_hi"):
             np.testing.assert_allclose(rates[name][f"value{end}"], row[f"{column}{end}"])
 
@@ -116,5 +119,5 @@ def test_without_a_threshold_no_rate_pretends(case):
     )
     rows = rows_of(blind)
     assert rows["abstained"]["frames"] == rows["test split"]["frames"]
-    assert counts.THRESHOLD_FAR not in counts.rates_of(blind)
+    assert summary_text.THRESHOLD_FAR not in summary_text.rates_of(blind)
     assert any("no threshold" in sentence for sentence in find_words(blind))

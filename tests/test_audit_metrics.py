@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score, roc_auc_score
 
 from taojax.audit import labels, metrics
-from taojax.audit import metrics as bootstrap
 from taojax.errors import InputError
 
 cases = st.lists(
@@ -54,8 +53,8 @@ def test_lengths_that_differ_are_refused():
 def test_weighted_statistics_equal_scikit_learn_for_every_resample(rng):
     signal = rng.integers(0, 12, 80).astype(float)
     is_out = rng.random(80) < 0.4
-    weights = bootstrap.block_weights(80, 7, 25, seed=3)
-    got = bootstrap.weighted_separation(signal, is_out, weights)
+    weights = metrics.block_weights(80, 7, 25, seed=3)
+    got = metrics.weighted_separation(signal, is_out, weights)
     for row, w in enumerate(weights):
         assert got.auroc[row] == pytest.approx(roc_auc_score(is_out, signal, sample_weight=w))
         out = average_precision_score(is_out, signal, sample_weight=w)
@@ -69,7 +68,7 @@ def test_weighted_statistics_equal_scikit_learn_for_every_resample(rng):
 
 def test_equal_weights_give_the_point_estimates(rng):
     signal, is_out = rng.normal(size=60), rng.random(60) < 0.5
-    got = bootstrap.weighted_separation(signal, is_out, np.ones((1, 60)))
+    got = metrics.weighted_separation(signal, is_out, np.ones((1, 60)))
     point = (metrics.auroc(signal, is_out), *metrics.aupr(signal, is_out))
     np.testing.assert_allclose([got.auroc[0], got.aupr_out[0], got.aupr_in[0]], point)
     assert got.far_at_95[0] == metrics.far_at_95(signal, is_out)
@@ -78,17 +77,17 @@ def test_equal_weights_give_the_point_estimates(rng):
 def test_a_resample_without_a_class_is_lost():
     weights = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
     is_out = np.array([False, False, True, True])
-    got = bootstrap.weighted_separation(np.arange(4.0), is_out, weights)
+    got = metrics.weighted_separation(np.arange(4.0), is_out, weights)
     np.testing.assert_array_equal(got.auroc, [np.nan, 1.0])
 
 
 def test_an_interval_is_blank_when_most_resamples_are_lost():
-    assert np.isnan(bootstrap.interval(np.array([0.5, np.nan, np.nan]))).all()
-    assert np.isfinite(bootstrap.interval(np.array([0.5, 0.6, np.nan]))).all()
+    assert np.isnan(metrics.interval(np.array([0.5, np.nan, np.nan]))).all()
+    assert np.isfinite(metrics.interval(np.array([0.5, 0.6, np.nan]))).all()
 
 
 def test_block_resamples_keep_neighbours_together_and_the_length():
-    weights = bootstrap.block_weights(100, 10, 200, seed=0)
+    weights = metrics.block_weights(100, 10, 200, seed=0)
     assert (weights.sum(axis=1) == 100).all()
     together = np.mean(weights[:, 20] == weights[:, 21])
     apart = np.mean(weights[:, 20] == weights[:, 60])
@@ -96,17 +95,15 @@ def test_block_resamples_keep_neighbours_together_and_the_length():
 
 
 def test_the_same_seed_draws_the_same_resamples():
-    first, again = (bootstrap.block_weights(30, 4, 5, seed=9) for _ in range(2))
+    first, again = (metrics.block_weights(30, 4, 5, seed=9) for _ in range(2))
     np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, bootstrap.block_weights(30, 4, 5, seed=10))
+    assert not np.array_equal(first, metrics.block_weights(30, 4, 5, seed=10))
 
 
 def test_the_interval_of_white_noise_holds_one_half(rng):
     signal, is_out = rng.normal(size=600), np.arange(600) % 2 == 0
-    drawn = bootstrap.weighted_separation(
-        signal, is_out, bootstrap.block_weights(600, 10, 200, seed=0)
-    )
-    low, high = bootstrap.interval(drawn.auroc)
+    drawn = metrics.weighted_separation(signal, is_out, metrics.block_weights(600, 10, 200, seed=0))
+    low, high = metrics.interval(drawn.auroc)
     assert low < 0.5 < high
     assert high - low < 0.2
 
@@ -115,14 +112,14 @@ def test_weighted_median_equals_the_median_of_the_repeated_values(rng):
     value = rng.normal(size=9)
     weights = rng.integers(0, 4, (20, 9)).astype(float)
     weights[:, 0] += 1
-    got = bootstrap.weighted_median(value, weights)
+    got = metrics.weighted_median(value, weights)
     want = [np.median(np.repeat(value, w.astype(int))) for w in weights]
     np.testing.assert_allclose(got, want)
-    assert np.isnan(bootstrap.weighted_median(value, np.zeros((1, 9)))).all()
+    assert np.isnan(metrics.weighted_median(value, np.zeros((1, 9)))).all()
 
 
 def test_weighted_mean_of_nothing_is_nan():
-    got = bootstrap.weighted_mean(np.array([1.0, 3.0]), np.array([[1.0, 1.0], [0.0, 0.0]]))
+    got = metrics.weighted_mean(np.array([1.0, 3.0]), np.array([[1.0, 1.0], [0.0, 0.0]]))
     np.testing.assert_array_equal(got, [2.0, np.nan])
 
 

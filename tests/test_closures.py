@@ -13,8 +13,7 @@ from judged import made_up, seal
 
 from taojax.cli import main
 from taojax.errors import InputError
-from taojax.files import pose_graph_io as closures
-from taojax.files import records
+from taojax.files import pose_graph_io, records
 from taojax.files.tables import read_table, table_text
 from taojax.risk import to_toml
 
@@ -181,12 +180,12 @@ def graph(n=6, **changes):
         "sigma_rad": 0.1,
         "spacing_m": 1.0,
     }
-    return closures.Graph(**(made | changes))
+    return pose_graph_io.Graph(**(made | changes))
 
 
 def test_unix_stamps_keep_their_digits_and_equal_ones_are_told_once():
     t_s = 1628226000.123456 + np.array([0.0, 0.1, 0.1, 0.2, 0.2, 0.3])
-    lines = closures.tum_text(graph(t_s=t_s)).splitlines()
+    lines = pose_graph_io.tum_text(graph(t_s=t_s)).splitlines()
     assert [float(line.split()[0]) for line in lines] == np.unique(t_s).tolist()
 
 
@@ -195,10 +194,10 @@ def test_between_accepted_frames_odometry_carries_on_and_each_trial_starts_alone
     known = np.full((8, 3), np.nan)
     known[2] = [10.0, 5.0, np.pi / 2]
     is_start = np.arange(8) % 4 == 0
-    poses = closures._chained(odometry, known, is_start)
+    poses = pose_graph_io._chained(odometry, known, is_start)
     np.testing.assert_allclose(poses[:4, :2], [[10, 3], [10, 4], [10, 5], [10, 6]], atol=1e-12)
     np.testing.assert_allclose(poses[4:, :2], [[0, 0], [1, 0], [2, 0], [3, 0]], atol=1e-12)
-    lines = closures.g2o_text(graph(n=8, odometry=odometry, is_start=is_start), "accept")
+    lines = pose_graph_io.g2o_text(graph(n=8, odometry=odometry, is_start=is_start), "accept")
     driven = [line.split()[1:3] for line in lines.splitlines() if line.startswith("EDGE")][2:8]
     assert ["6", "7"] not in driven
     assert len(driven) == 6
@@ -207,7 +206,7 @@ def test_between_accepted_frames_odometry_carries_on_and_each_trial_starts_alone
 def test_the_covariance_of_a_closure_is_written_in_the_axes_of_its_pose(tmp_path):
     covariance = np.array([[4.0, 1.0, 0.1], [1.0, 2.0, 0.2], [0.1, 0.2, 0.3]])
     made = graph(covariance=np.tile(covariance, (6, 1, 1)))
-    (tmp_path / "closures.g2o").write_text(closures.g2o_text(made, "accept"))
+    (tmp_path / "closures.g2o").write_text(pose_graph_io.g2o_text(made, "accept"))
     *_, information = read_g2o(tmp_path / "closures.g2o")[1][-1]
     turn = np.eye(3)
     turn[:2, :2] = matrix(made.pose[0])[:2, :2].T
@@ -217,7 +216,7 @@ def test_the_covariance_of_a_closure_is_written_in_the_axes_of_its_pose(tmp_path
 def test_a_frame_without_pose_closes_nothing():
     made = graph(map_index=np.array([1, -1, 1, -1, 1, 1]))
     assert made.rows("accept").tolist() == [0, 2, 4, 5]
-    assert len(closures.tum_text(made).splitlines()) == 4
+    assert len(pose_graph_io.tum_text(made).splitlines()) == 4
 
 
 def fails(capsys, *words):
@@ -252,7 +251,7 @@ def test_tables_of_other_frames_are_refused_before_anything_is_written(
 
 def test_the_judge_who_knows_the_place_comes_first(scored, tmp_path, capsys):
     folder, out = judged(scored, tmp_path / "run"), tmp_path / "elsewhere"
-    assert closures.read_verdicts(folder, records.read_run(folder)).source == "verdicts.csv"
+    assert pose_graph_io.read_verdicts(folder, records.read_run(folder)).source == "verdicts.csv"
     assert main(["closures", str(folder), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "verdicts of verdicts.csv" in said
@@ -276,7 +275,7 @@ def test_every_frame_is_counted_once(run, tmp_path, capsys):
 
 
 def test_what_decided_is_sealed_with_its_decisions(run, tmp_path, capsys):
-    sealed = closures.read_verdicts(run, records.read_run(run))
+    sealed = pose_graph_io.read_verdicts(run, records.read_run(run))
     assert sealed.source == "decisions.csv"
     assert sealed.calibration.final.columns == ("place",)
     assert sealed.calibration.now.columns == ("now_place",)
@@ -296,14 +295,17 @@ def test_what_decided_is_sealed_with_its_decisions(run, tmp_path, capsys):
 def test_verdicts_of_another_run_are_refused(scored, tmp_path):
     folder = judged(scored, tmp_path / "run", seal="0" * 64)
     with pytest.raises(InputError, match="another run"):
-        closures.read_verdicts(folder, records.read_run(folder))
+        pose_graph_io.read_verdicts(folder, records.read_run(folder))
 
 
 def test_a_run_sealed_without_odometry_is_told_to_score_again(run, tmp_path):
     folder, _ = seal(tmp_path)
-    verdicts, sealed = closures.read_verdicts(run, records.read_run(run)), records.read_run(folder)
+    verdicts, sealed = (
+        pose_graph_io.read_verdicts(run, records.read_run(run)),
+        records.read_run(folder),
+    )
     with pytest.raises(InputError, match="score the data set again"):
-        closures.build_graph(folder, sealed, verdicts)
+        pose_graph_io.build_graph(folder, sealed, verdicts)
 
 
 def test_another_share_of_wrong_ones_decides_again_and_another_lag_is_refused(

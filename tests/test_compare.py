@@ -11,7 +11,6 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from taojax.audit import compare, figures, report, tables
-from taojax.audit import compare as compare_report
 from taojax.audit import metrics as bootstrap
 from taojax.audit.evaluate import evaluate
 from taojax.cli import main
@@ -134,7 +133,7 @@ def test_a_broken_detector_is_worse_and_from_the_other_side_better(folder):
         found = compare.compare([folder / name for name in order])
         got = rows(found, signal="tao", measure="auroc")
         assert set(got["finding"]) == {finding}
-        said = " ".join(compare_report.sentences(found))
+        said = " ".join(compare.sentences(found))
         assert re.search(rf"{order[1]} is {finding} than {order[0]} in tao on \d+ in-map", said)
         assert "prevalence" in said
         assert set(rows(found, signal="top1")["finding"]) == {"equal"}
@@ -142,7 +141,7 @@ def test_a_broken_detector_is_worse_and_from_the_other_side_better(folder):
 
 def test_a_run_that_is_the_same_is_called_so(folder, copy):
     found = compare.compare([folder / "plain", copy("plain")])
-    said = " ".join(compare_report.sentences(found))
+    said = " ".join(compare.sentences(found))
     assert "carry the same seal: they are one run" in said
     assert set(found.table["finding"]) == {"equal"}
     assert "differences from" in said
@@ -177,7 +176,7 @@ def test_causes_name_settings_and_inputs_that_differ(folder, tmp_path, copy):
     facts = {"sha256": {"inputs/query/descriptors.npy": "1" * 64}}
     other = reseal(run, tmp_path / "other", config=config, manifest=facts)
     judge(other, folder / "truth", judged.config())
-    said = compare_report.sentences(compare.compare([run, other]))[0]
+    said = compare.sentences(compare.compare([run, other]))[0]
     assert "stream.branches 7 against 100" in said
     assert "other query/descriptors.npy" in said
 
@@ -190,7 +189,7 @@ def test_runs_with_other_gaps_are_measured_on_the_frames_that_all_hold_out(folde
     test = found.scopes[1]
     assert len(test.frame) == min(held) < max(held)
     assert found.block_frames == 60
-    assert f"measured are the {len(test.frame)}" in " ".join(compare_report.sentences(found))
+    assert f"measured are the {len(test.frame)}" in " ".join(compare.sentences(found))
 
 
 def test_a_recording_without_a_map_out_frame_has_no_intervals_and_says_so(tmp_path):
@@ -202,8 +201,8 @@ def test_a_recording_without_a_map_out_frame_has_no_intervals_and_says_so(tmp_pa
     measured = found.table["measure"] == "frr"
     assert set(found.table["finding"][~measured]) == {"no interval"}
     assert np.isnan(found.table["difference"][~measured]).all()
-    assert "differences have no interval" in " ".join(compare_report.sentences(found))
-    compare_report.write(found, tmp_path / "out", "taojax compare")
+    assert "differences have no interval" in " ".join(compare.sentences(found))
+    compare.write(found, tmp_path / "out", "taojax compare")
 
 
 def test_the_verb_writes_table_figure_and_page_and_prints_the_words(folder, tmp_path, capsys):
@@ -246,7 +245,7 @@ def test_one_run_is_a_usage_error(folder, capsys):
 def test_odd_folder_names_break_no_table(name, folder, tmp_path):
     odd = shutil.copytree(folder / "weak", tmp_path / name)
     found = compare.compare([folder / "plain", odd])
-    compare_report.write(found, tmp_path / "out", "taojax compare")
+    compare.write(found, tmp_path / "out", "taojax compare")
     table = read_table(tmp_path / "out" / "tables/compare.csv", "compare")
     assert len(set(table["run"])) == 1
     lines = (tmp_path / "out" / "tables/compare.md").read_text().splitlines()

@@ -270,7 +270,7 @@ def both_forms(p, branches, weight):
 def test_the_fast_form_is_vmap_over_one_branch_bit_for_bit(trial, rng, monkeypatch):
     # One operation at a time and sums frame by frame: no compiler orders the roundings anew.
     for module in (cost_module, procrustes):
-        monkeypatch.setattr(module, "over_frames", lambda x: functools.reduce(jnp.add, x))
+        monkeypatch.setattr(module, "sum_over_frames", lambda x: functools.reduce(jnp.add, x))
     with jax.disable_jit():
         one_by_one, at_once = both_forms(*hypotheses(rng, jnp.float32))
     jax.tree.map(np.testing.assert_array_equal, one_by_one, at_once)

@@ -12,8 +12,7 @@ from conftest import loop, motions, write_folder
 from taojax.audit import graph as judge
 from taojax.cli import main
 from taojax.config import AuditConfig
-from taojax.files import pose_graph_io as closures
-from taojax.files import records
+from taojax.files import pose_graph_io, records
 from taojax.files.pose_graph_io import compose, wrap
 from taojax.files.tables import read_table
 from taojax.graph import answers, methods, odometry
@@ -558,7 +557,7 @@ def test_bad_input_is_one_line(audited, tmp_path, capsys):
 def test_newer_verdicts_bring_poses_of_their_own(audited, monkeypatch):
     run = records.read_run(audited / "run")
     old = answers.read_answers(audited / "run", run)
-    real = closures.read_frames
+    real = pose_graph_io.read_frames
 
     def newer(path, name, n):
         table = real(path, name, n)

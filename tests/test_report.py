@@ -9,13 +9,13 @@ import judged
 import numpy as np
 import pytest
 
-from taojax.audit import figures
-from taojax.audit import frame_explorer as route
+from taojax.audit import figures, frame_explorer
 from taojax.audit.evaluate import evaluate
 from taojax.audit.html import Page, glossary, marked, names_of_signals, render
 from taojax.audit.opening import TOO_SHORT, UNKNOWN, sentence
 from taojax.audit.summary_text import NO_SHIELD, find_words, span, warnings
 from taojax.files import records
+from taojax.risk import DOUBT_COUNTS
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def held(case):
     return (
         sealed,
         done,
-        json.loads(route.route_json(done.judgement, sealed.index, sealed.similarity)),
+        json.loads(frame_explorer.route_json(done.judgement, sealed.index, sealed.similarity)),
     )
 
 
@@ -220,21 +220,23 @@ def test_terms_on_the_page_add_up_to_the_probability(held):
     ]
     odds = np.sum(terms, axis=0) + done.judgement.calibration.final.bias
     at = [signal["name"] for signal in found["signals"]].index("probability_wrong")
-    np.testing.assert_allclose(1 / (1 + np.exp(-odds)), values[at], atol=1e-5)
+    lone = [signal["name"] for signal in found["signals"]].index("alone")
+    least = np.minimum(1.0, DOUBT_COUNTS * values[lone])
+    np.testing.assert_allclose(np.maximum(1 / (1 + np.exp(-odds)), least), values[at], atol=1e-5)
 
 
 def test_a_long_run_is_thinned_and_says_so(held, monkeypatch):
     sealed, done, _ = held
-    monkeypatch.setattr(route, "MOST_FRAMES", 100)
-    found = json.loads(route.route_json(done.judgement, sealed.index, sealed.similarity))
+    monkeypatch.setattr(frame_explorer, "MOST_FRAMES", 100)
+    found = json.loads(frame_explorer.route_json(done.judgement, sealed.index, sealed.similarity))
     assert (found["every"], found["frames"], len(found["verdict"])) == (3, 240, 80)
     assert found["verdict"][1] == held[2]["verdict"][3]
 
 
 def test_fewer_candidates_are_embedded_where_there_is_no_room(held, monkeypatch):
     sealed, done, _ = held
-    monkeypatch.setattr(route, "_CANDIDATE_BYTES", 16_000)
-    found = json.loads(route.route_json(done.judgement, sealed.index, sealed.similarity))
+    monkeypatch.setattr(frame_explorer, "_CANDIDATE_BYTES", 16_000)
+    found = json.loads(frame_explorer.route_json(done.judgement, sealed.index, sealed.similarity))
     assert found["candidates"]["k"] == 12
     assert found["candidates"]["of"] == 100
 
@@ -244,7 +246,7 @@ def test_text_of_a_run_cannot_end_the_script_that_holds_it(held):
     verdicts = dict(done.judgement.verdicts)
     verdicts["reason"] = np.full(240, "</script><b>", dtype=object)
     judgement = done.judgement._replace(verdicts=verdicts)
-    text = route.route_json(judgement, sealed.index, sealed.similarity)
+    text = frame_explorer.route_json(judgement, sealed.index, sealed.similarity)
     assert "<" not in text
     assert json.loads(text)["reasons"] == ["</script><b>"]
 

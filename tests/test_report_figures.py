@@ -8,9 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from taojax.audit import figures
-from taojax.audit import figures as scenario_figures
-from taojax.audit import summary_text as summary
+from taojax.audit import figures, summary_text
 from taojax.audit.evaluate import paste_files
 from taojax.audit.judgement import Evaluation, judge
 from taojax.audit.labels import read_truth
@@ -70,7 +68,7 @@ def test_strict_labels_with_one_class_draw_nothing(tmp_path):
 
 def test_the_trace_figure_holds_every_frame_of_every_scenario(judgement, tmp_path):
     done = Evaluation(tmp_path, judgement, (), "taojax audit")
-    picture = scenario_figures.traces({"default": done, "h3": done})
+    picture = figures.traces({"default": done, "h3": done})
     table = csv(picture)
     assert len(table) == 2 * len(judgement.label)
     assert set(table["scenario"]) == {"default", "h3"}
@@ -80,7 +78,7 @@ def test_the_trace_figure_holds_every_frame_of_every_scenario(judgement, tmp_pat
 
 def test_the_maps_figure_holds_true_and_answered_positions(judgement, tmp_path):
     done = Evaluation(tmp_path, judgement, (), "taojax audit")
-    table = csv(summary.maps({"default": done}))
+    table = csv(summary_text.maps({"default": done}))
     test = judgement.splits.test.frame
     np.testing.assert_array_equal(table["frame"], test)
     true = table[["true_x_m", "true_y_m"]].to_numpy()
@@ -91,7 +89,7 @@ def test_the_maps_figure_holds_true_and_answered_positions(judgement, tmp_path):
 def test_the_trace_figure_draws_a_run_without_thresholds(judgement, tmp_path):
     metrics = judgement.metrics | {"threshold": np.full(len(judgement.metrics["signal"]), np.nan)}
     blind = Evaluation(tmp_path, judgement._replace(metrics=metrics), (), "taojax audit")
-    assert scenario_figures.traces({"default": blind}).png
+    assert figures.traces({"default": blind}).png
 
 
 def test_the_pasted_tables_hold_the_main_signals_with_their_intervals(judgement):

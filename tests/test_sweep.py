@@ -10,7 +10,7 @@ from taojax.audit.labels import TestSplit as HeldOut
 from taojax.audit.labels import split_frames
 from taojax.config import Config, StreamConfig, replace
 from taojax.errors import ConfigError
-from taojax.runtime import sweep as grids
+from taojax.runtime import sweep
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.stream import replay
@@ -51,12 +51,12 @@ def frames_of(rng, n=40, k=10):
 def parsed(text):
     import tomllib
 
-    return grids.parse(tomllib.loads(text))
+    return sweep.parse(tomllib.loads(text))
 
 
 def streamed(row, poses, frames):
     """The signal of a stream compiled for one row's own sizes."""
-    own = {k: v for k, v in row.items() if k in grids.COLUMNS}
+    own = {k: v for k, v in row.items() if k in sweep.COLUMNS}
     config = replace(BASE, {"association": row["association"], **own})
     return np.asarray(replay(config, map_tables(poses), frames)[1].signals["tao"])
 
@@ -64,7 +64,7 @@ def streamed(row, poses, frames):
 @pytest.fixture(scope="module")
 def swept():
     poses, frames = frames_of(np.random.default_rng(5))
-    rows = grids.expand(parsed(GRID), BASE)
+    rows = sweep.expand(parsed(GRID), BASE)
     tables = map_tables(poses)
     found = {}
     for signals, units in plan(rows, BASE, tables, frames):
@@ -115,16 +115,16 @@ def test_units_share_the_fit_of_gamma_and_branches(swept):
 
 
 def test_the_default_grid_holds_256_rank_configurations_and_the_defaults():
-    rows = grids.expand(grids.DEFAULT, Config())
+    rows = sweep.expand(sweep.DEFAULT, Config())
     assert sum(row["association"] == "rank" for row in rows) == 256
     defaults = [row for row in rows if row["is_default"]]
     assert [row["association"] for row in defaults] == ["rank", "joint"]
     assert all(row["is_in_grid"] for row in rows)
-    assert parsed(grids.to_toml(grids.DEFAULT)) == grids.DEFAULT
+    assert parsed(sweep.grid_to_toml(sweep.DEFAULT)) == sweep.DEFAULT
 
 
 def test_own_settings_outside_the_product_are_added_for_comparison():
-    rows = grids.expand(parsed("lambda_velocity = [0, 0.1]"), Config())
+    rows = sweep.expand(parsed("lambda_velocity = [0, 0.1]"), Config())
     assert [(row["lambda_velocity"], row["is_in_grid"]) for row in rows] == [
         (0.0, True), (0.1, True), (1.0, False),
     ]  # fmt: skip
@@ -156,18 +156,18 @@ def test_a_bad_grid_is_refused_with_the_reason(text, tmp_path):
     path = tmp_path / "grid.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=BAD[text]) as caught:
-        grids.read_grid(path)
+        sweep.read_grid(path)
     assert str(path) in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
 
 def test_flags_pin_a_setting_and_an_association():
-    pinned = grids.pin(parsed(GRID), {"window": 5, "branches": None}, "rank")
+    pinned = sweep.pin(parsed(GRID), {"window": 5, "branches": None}, "rank")
     assert list(pinned) == ["rank"]
     assert pinned["rank"]["window"] == (5,)
     assert pinned["rank"]["branches"] == (3, 8)
     with pytest.raises(ConfigError, match="sweeps rank only"):
-        grids.pin(pinned, {}, "joint")
+        sweep.pin(pinned, {}, "joint")
 
 
 # The judge.
@@ -175,8 +175,8 @@ def test_flags_pin_a_setting_and_an_association():
 
 def made_sweep(tao):
     """A sealed sweep in memory around some signals."""
-    rows = grids.expand(parsed(f"lambda_velocity = {list(range(len(tao)))}"), Config())
-    grid = grids.as_table(rows)
+    rows = sweep.expand(parsed(f"lambda_velocity = {list(range(len(tao)))}"), Config())
+    grid = sweep.as_table(rows)
     return judge_sweep.SealedSweep(grid, tao, np.zeros((3, 2)), {"seal": "x"})
 
 

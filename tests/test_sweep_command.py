@@ -13,7 +13,7 @@ from conftest import table, write_folder
 
 from taojax.cli import main
 from taojax.errors import InputError
-from taojax.runtime import sweep as sweep_run
+from taojax.runtime import sweep
 
 SMALL_GRID = """
 association = ["rank"]
@@ -89,7 +89,7 @@ def test_the_command_leaves_every_file_and_refuses_a_second_run(world, tmp_path,
 def test_an_interrupted_sweep_goes_on_without_computing_again(world, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     words = [*words_of(world, out, "more.toml"), "--no-judge"]
-    real, computed = sweep_run.evaluate, []
+    real, computed = sweep.evaluate, []
 
     def stops_after(n):
         def evaluate(signals, units, *, batch):
@@ -124,10 +124,10 @@ def test_an_interrupted_sweep_goes_on_without_computing_again(world, tmp_path, m
 
 def test_changed_input_is_another_sweep(world, tmp_path):
     key = {"input data": "a", "grid": "b"}
-    sweep_run.begin(tmp_path / "run", key)
-    sweep_run.begin(tmp_path / "run", key)
+    sweep.begin(tmp_path / "run", key)
+    sweep.begin(tmp_path / "run", key)
     with pytest.raises(InputError, match="another input data"):
-        sweep_run.begin(tmp_path / "run", {"input data": "c", "grid": "b"})
+        sweep.begin(tmp_path / "run", {"input data": "c", "grid": "b"})
 
 
 def test_bad_grids_and_taken_folders_are_exit_3(world, tmp_path, capsys):

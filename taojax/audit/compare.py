@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from taojax.audit import figures, metrics, tables
-from taojax.audit import metrics as bootstrap
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.errors import InputError
 from taojax.files.records import input_hashes, publish, read_run
@@ -179,7 +178,7 @@ def _scopes(runs: Sequence[Judged], seed: int) -> tuple[int, tuple[Scope, ...]]:
     held = np.flatnonzero(np.all([run.split == "test" for run in runs], axis=0))
     frames = {"all": np.arange(len(runs[0].label)), "test": held}
     return block, tuple(
-        Scope(name, frame, bootstrap.block_weights(len(frame), block, most, seed))
+        Scope(name, frame, metrics.block_weights(len(frame), block, most, seed))
         for name, frame in frames.items()
     )
 
@@ -199,7 +198,7 @@ def measure(run: Judged, signal: str, scope: Scope) -> dict[str, tuple[float, np
     is_in, is_out, found = label == "in_map", label == "map_out", {}
     known = is_in | is_out
     if is_in.any() and is_out.any():
-        drawn = bootstrap.weighted_separation(values[known], is_out[known], scope.weights[:, known])
+        drawn = metrics.weighted_separation(values[known], is_out[known], scope.weights[:, known])
         point = {"auroc": metrics.auroc, "far_at_95": metrics.far_at_95}
         for name in SEPARATIONS:
             value = point[name](values[known], is_out[known])
@@ -209,7 +208,7 @@ def measure(run: Judged, signal: str, scope: Scope) -> dict[str, tuple[float, np
         accepted = (values <= threshold).astype(float)
         for name, chosen, hit in (("far", is_out, accepted), ("frr", is_in, 1.0 - accepted)):
             if chosen.any():
-                drawn_rate = bootstrap.weighted_mean(hit[chosen], scope.weights[:, chosen])
+                drawn_rate = metrics.weighted_mean(hit[chosen], scope.weights[:, chosen])
                 found[name] = float(hit[chosen].mean()), drawn_rate
     return found
 
@@ -245,7 +244,7 @@ def _rows(run: Judged, reference: Judged, scopes: Sequence[Scope]) -> list[dict[
                 if n_in + n_out:
                     row["prevalence"] = n_out / (n_in + n_out)
                 if name in ours and name in theirs:
-                    low, high = bootstrap.interval(ours[name][1] - theirs[name][1])
+                    low, high = metrics.interval(ours[name][1] - theirs[name][1])
                     row |= {
                         "value": ours[name][0], "reference_value": theirs[name][0],
                         "difference": ours[name][0] - theirs[name][0], "difference_lo": low,

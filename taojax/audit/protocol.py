@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from taojax.audit import calibration, metrics
-from taojax.audit import metrics as bootstrap
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.labels import TestSplit
 from taojax.audit.summary_text import PAPER_TABLE_2, WHOLE, cut_maps, metric_row
@@ -70,7 +69,7 @@ def frozen_table(scenarios: Mapping[str, Evaluation]) -> Table:
     for scenario, done in cut.items():
         judgement = done.judgement
         test, audit = judgement.splits.test, judgement.config.audit
-        weights = bootstrap.block_weights(
+        weights = metrics.block_weights(
             len(test.frame), audit.block_frames, audit.n_bootstrap, judgement.config.seed
         )
         for name in COMPARED:

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taojax.audit import figures, protocol, tables
-from taojax.audit import figures as scenario_figures
-from taojax.audit import summary_text as summary
+from taojax.audit import figures, protocol, summary_text, tables
 from taojax.audit.figures import Picture
 from taojax.audit.frame_explorer import route_json
 from taojax.audit.html import (
@@ -176,7 +174,7 @@ def run_page(done: Evaluation, pictures: Sequence[Picture]) -> str:
 
 def _summary_words(scenarios: Mapping[str, Evaluation], base: Evaluation) -> list[str]:
     said = []
-    for name, done in summary.cut_maps(scenarios).items():
+    for name, done in summary_text.cut_maps(scenarios).items():
         said += [f"{name}: {told}" for told in done.graph]
         tao, top1 = (metric_row(done.judgement, s) for s in ("tao", "top1"))
         far = rates_of(done.judgement)[VERDICT_FAR]
@@ -245,15 +243,15 @@ def write_summary(
     Raises:
         InputError: a file cannot be written.
     """
-    base = scenarios.get(summary.WHOLE, next(iter(scenarios.values())))
+    base = scenarios.get(summary_text.WHOLE, next(iter(scenarios.values())))
     frozen = protocol.frozen_table(scenarios)
     words = (*_summary_words(scenarios, base), *protocol.frozen_words(frozen))
     mapout, recall, micro = (
-        summary.mapout_table(scenarios), base.judgement.recall, base.judgement.micro,
+        summary_text.mapout_table(scenarios), base.judgement.recall, base.judgement.micro,
     )  # fmt: skip
     pictures = (figures.retrieval(base.judgement), *figures.strict(base.judgement))
-    if cut := summary.cut_maps(scenarios):
-        pictures = (summary.compare(scenarios), scenario_figures.traces(cut), *pictures)
+    if cut := summary_text.cut_maps(scenarios):
+        pictures = (summary_text.compare(scenarios), figures.traces(cut), *pictures)
     said = {note for done in scenarios.values() for note in _notes(done.judgement)}
     others, warned = sorted(said - set(notes)), all_alarms(scenarios)
     seals = {name: str(done.judgement.manifest["seal"]) for name, done in scenarios.items()}
@@ -277,7 +275,7 @@ def write_summary(
                  note=_NOT_OURS, columns=_mapout_columns("far")),
             *_frozen_grids(frozen),
             grid("recall", recall, title="Answerability and recall, map not cut"),
-            grid("recall", summary.paper_recall_table(), title="The paper's Table 1",
+            grid("recall", summary_text.paper_recall_table(), title="The paper's Table 1",
                  note="Printed for comparison.")._replace(source="the paper"),
             *_micro_grids(micro),
         ],
@@ -287,7 +285,7 @@ def write_summary(
         warnings=warned,
     )  # fmt: skip
     files: dict[str, str | bytes] = {
-        "metrics.csv": summary.joined_metrics(scenarios),
+        "metrics.csv": summary_text.joined_metrics(scenarios),
         "report.html": render(page),
         "manifest.json": json.dumps(manifest, indent=2) + "\n",
     }
@@ -296,7 +294,7 @@ def write_summary(
     ):  # fmt: skip
         files |= tables.as_files(name, table)
     # The page opens with the maps; in the folder they stand beside the other figures.
-    for drawn in (summary.maps(scenarios), *pictures):
+    for drawn in (summary_text.maps(scenarios), *pictures):
         files |= figures.as_files(drawn)
     for name, content in files.items():
         write_atomically(out / name, content)

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 from matplotlib.figure import Figure
 
 from taojax import plots
-from taojax.audit import metrics as bootstrap
+from taojax.audit import metrics
 from taojax.audit.calibration import FALLBACK
 from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.judgement import Evaluation, Judgement
@@ -92,9 +92,7 @@ def rates_table(judgement: Judgement) -> Table:
     """
     test, audit = judgement.splits.test, judgement.config.audit
     n = len(test.frame)
-    weights = bootstrap.block_weights(
-        n, audit.block_frames, audit.n_bootstrap, judgement.config.seed
-    )
+    weights = metrics.block_weights(n, audit.block_frames, audit.n_bootstrap, judgement.config.seed)
     rows = []
     for name, what, among, chosen in _counted(judgement):
         of = test.is_out if among == AMONG["FAR"] else test.is_in
@@ -102,8 +100,8 @@ def rates_table(judgement: Judgement) -> Table:
         row: dict[str, Any] = {"rate": name, "counted": what, "among": among}
         row |= {"n": hit.sum(), "n_of": len(hit), "value": hit.mean() if len(hit) else NAN}
         if len(hit):
-            drawn = bootstrap.weighted_mean(hit, weights[:, of])
-            row["value_lo"], row["value_hi"] = bootstrap.interval(drawn)
+            drawn = metrics.weighted_mean(hit, weights[:, of])
+            row["value_lo"], row["value_hi"] = metrics.interval(drawn)
         rows.append(row)
     return from_rows("rates", rows)
 

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from taojax.audit import calibration, labels, metrics, tables
-from taojax.audit import metrics as bootstrap
 from taojax.audit.figures import Picture, as_files, csv_text, picture
 from taojax.audit.labels import read_truth
 from taojax.config import Config
@@ -127,14 +126,14 @@ def _default(sealed: SealedSweep, config: Config) -> int:
 def _difference(test: labels.TestSplit, a: int, b: int, config: Config) -> str:
     """Say how far the AUROC of two configurations differ on the same test frames."""
     known, audit = test.is_in | test.is_out, config.audit
-    weights = bootstrap.block_weights(
+    weights = metrics.block_weights(
         len(test.label), audit.block_frames, audit.n_bootstrap, config.seed
     )[:, known]
     drawn = [
-        bootstrap.weighted_separation(test.signals[str(n)][known], test.is_out[known], weights)
+        metrics.weighted_separation(test.signals[str(n)][known], test.is_out[known], weights)
         for n in (a, b)
     ]
-    low, high = bootstrap.interval(drawn[0].auroc - drawn[1].auroc)
+    low, high = metrics.interval(drawn[0].auroc - drawn[1].auroc)
     if np.isnan(low):
         return "no interval: too few resamples hold both classes"
     shown = "" if low > 0 or high < 0 else ", so no difference is shown"

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from taojax.audit import calibration, metrics, risk
-from taojax.audit import metrics as bootstrap
 from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.config import AuditConfig
@@ -60,16 +59,16 @@ def separation_row(
         *metrics.aupr(signal, is_out),
         metrics.far_at_95(signal, is_out),
     )
-    samples = bootstrap.weighted_separation(signal, is_out, weights)
+    samples = metrics.weighted_separation(signal, is_out, weights)
     row = {}
     for name, value, drawn in zip(_STATISTICS, point, samples, strict=True):
         row[f"{name}{suffix}"] = value
-        row[f"{name}{suffix}_lo"], row[f"{name}{suffix}_hi"] = bootstrap.interval(drawn)
+        row[f"{name}{suffix}_lo"], row[f"{name}{suffix}_hi"] = metrics.interval(drawn)
     return row
 
 
 def _with_interval(name: str, value: float, samples: np.ndarray) -> dict[str, float]:
-    low, high = bootstrap.interval(samples)
+    low, high = metrics.interval(samples)
     return {name: value, f"{name}_lo": low, f"{name}_hi": high}
 
 
@@ -89,13 +88,13 @@ def operating_row(
         return {}
     point = metrics.operate(test, name, threshold)
     accepted = (test.signals[name] <= threshold).astype(float)
-    far = bootstrap.weighted_mean(accepted[test.is_out], weights[:, test.is_out])
-    frr = bootstrap.weighted_mean(1.0 - accepted[test.is_in], weights[:, test.is_in])
+    far = metrics.weighted_mean(accepted[test.is_out], weights[:, test.is_out])
+    frr = metrics.weighted_mean(1.0 - accepted[test.is_in], weights[:, test.is_in])
     row = {"threshold": threshold, "n_censored": float(point.is_censored.sum())}
     row |= _with_interval("far", point.far, far) | _with_interval("frr", point.frr, frr)
     if point.delays.size:
         delays, first = point.delays.astype(float), metrics.find_exits(test.label).first
-        drawn = bootstrap.weighted_median(delays, weights[:, first])
+        drawn = metrics.weighted_median(delays, weights[:, first])
         row |= _with_interval("delay_frames", float(np.median(delays)), drawn)
     return row
 
@@ -112,9 +111,7 @@ def probability_row(
     square = (probability - is_out) ** 2
     point = float(calibration.ece(probability, is_out, once)[0])
     row = _with_interval("ece", point, calibration.ece(probability, is_out, drawn))
-    return row | _with_interval(
-        "brier", float(square.mean()), bootstrap.weighted_mean(square, drawn)
-    )
+    return row | _with_interval("brier", float(square.mean()), metrics.weighted_mean(square, drawn))
 
 
 def _counts(split: CalibrationSplit | TestSplit, suffix: str) -> dict[str, float]:
@@ -142,8 +139,8 @@ def metrics_table(
         seed: of the bootstrap.
     """
     test, n_test = splits.test, len(splits.test.frame)
-    whole = bootstrap.block_weights(len(label), config.block_frames, config.n_bootstrap, seed)
-    held = bootstrap.block_weights(n_test, config.block_frames, config.n_bootstrap, seed)
+    whole = metrics.block_weights(len(label), config.block_frames, config.n_bootstrap, seed)
+    held = metrics.block_weights(n_test, config.block_frames, config.n_bootstrap, seed)
     known, known_test = label != "grey", test.is_in | test.is_out
     n_in, n_out = float((label == "in_map").sum()), float((label == "map_out").sum())
     prevalence = n_out / (n_in + n_out) if n_in + n_out else NAN
@@ -234,7 +231,7 @@ def verdict_table(
         config: block length and resamples.
         seed: of the bootstrap.
     """
-    weights = bootstrap.block_weights(len(frames), config.block_frames, config.n_bootstrap, seed)
+    weights = metrics.block_weights(len(frames), config.block_frames, config.n_bootstrap, seed)
     rows = []
     for name, column in (("now", "verdict_now"), ("final", "verdict")):
         own = answers.now if name == "now" else answers.final
@@ -248,10 +245,10 @@ def verdict_table(
         }  # fmt: skip
         for share, of, among in (("wrong", wrong, counted), ("recall", right, known)):
             if among.any():
-                drawn = bootstrap.weighted_mean(of[among].astype(float), weights[:, among])
+                drawn = metrics.weighted_mean(of[among].astype(float), weights[:, among])
                 value = "wrong_share" if share == "wrong" else "recall"
                 row[value] = of[among].mean()
-                row[f"{share}_lo"], row[f"{share}_hi"] = bootstrap.interval(drawn)
+                row[f"{share}_lo"], row[f"{share}_hi"] = metrics.interval(drawn)
         rows.append(row)
     return from_rows("verdict_table", rows)
 
@@ -283,7 +280,7 @@ def micro_table(
     seed: int,
 ) -> Table:
     """Measure every signal under strict labels at r_in / 2 and r_in, on all frames."""
-    weights = bootstrap.block_weights(len(nearest_m), config.block_frames, config.n_bootstrap, seed)
+    weights = metrics.block_weights(len(nearest_m), config.block_frames, config.n_bootstrap, seed)
     rows = []
     for radius in (config.r_in_m / 2, config.r_in_m):
         is_out = nearest_m > radius
@@ -292,7 +289,7 @@ def micro_table(
             row: dict[str, Any] = {"signal": name} | counts
             if is_out.any() and not is_out.all():
                 values = np.asarray(values, dtype=float)
-                drawn = bootstrap.weighted_separation(values, is_out, weights).auroc
+                drawn = metrics.weighted_separation(values, is_out, weights).auroc
                 row |= _with_interval("auroc", metrics.auroc(values, is_out), drawn)
             rows.append(row)
     return from_rows("micro", rows)

@@ -90,22 +90,20 @@ def make(data: Data) -> None:
 
 def _add(data: Files) -> None:
     """Make a folder of a map alone, or add a query or the truth to one that is there."""
-    from taojax.datasets import edit as additions
+    from taojax.datasets import edit
     from taojax.datasets.plain import read_session
 
     reading = reading_of(data, is_motion=False)
     out, truth = data.out, data.query_poses
     if data.map_poses is not None and data.map_descriptors is not None:
         mapped = read_session(data.map_poses, data.map_poses.parent, reading)
-        added = additions.make_map(out, mapped, data.map_descriptors)
+        added = edit.make_map(out, mapped, data.map_descriptors)
     elif truth is not None and (out / "query/odometry.csv").exists() and data.odometry is None:
-        added = additions.add_truth(
-            out, truth, reading, gate_s=data.gate_s, offset_s=data.clock_offset
-        )
+        added = edit.add_truth(out, truth, reading, gate_s=data.gate_s, offset_s=data.clock_offset)
     else:
         # Odometry over odometry is refused before its views are asked for.
         query = None if truth is None else read_session(truth, truth.parent, reading)
-        added = additions.add_query(out, query, _choices(data))
+        added = edit.add_query(out, query, _choices(data))
     say(f"added {', '.join(added.names)}")
     for note in added.notes:
         say(f"note: {note}")
