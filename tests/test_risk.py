@@ -559,3 +559,29 @@ def test_any_signal_is_judged_under_the_rule_of_the_verdicts():
     blank = np.full(100, np.nan)
     assert judge.level_row(blank, own, rank, own, 0.05) == {}
     assert judge.level_row(rank, own, blank, own, 0.05) == {}
+
+
+@pytest.mark.filterwarnings("ignore:All provided predict_params", "ignore:No predict parameters")
+@pytest.mark.parametrize("factor", [0.1, 0.5, 1.0, 2.0])
+def test_what_mapie_proves_is_promised_with_confidence(factor, rng, monkeypatch):
+    """With frames that are exchangeable one by one, its bound is the wider of the two."""
+    mapie = pytest.importorskip("mapie.risk_control")
+    monkeypatch.setattr(judge, "CORRELATED_FRAMES", 1.0)
+    level, n, proved, promised = 0.12, 600, 0, 0
+    for _ in range(20):
+        p = rng.random(n) ** 3
+        is_wrong = rng.random(n) < np.minimum(1.0, factor * p)
+        both = np.stack([p, 1.0 - p], axis=1)
+        control = mapie.BinaryClassificationController(
+            lambda rows: rows, risk="precision", target_level=0.95, confidence_level=0.9,
+            list_predict_params=np.array([1.0 - level]),
+        )  # fmt: skip
+        control.calibrate(both, (~is_wrong).astype(int))
+        risk_ = FINAL._replace(levels=np.full(3, level), max_wrong=0.05)
+        said = judge.promise_words(risk_, p, Own(~is_wrong, is_wrong))
+        does = len(control.valid_predict_params) > 0
+        is_promised = "with 90% confidence if blocks of 1 frames are exchangeable" in said
+        proved, promised = proved + does, promised + is_promised
+        assert is_promised or not does
+    # An easy world is proved by both, a hopeless one by neither.
+    assert (proved, promised) == {0.1: (20, 20), 2.0: (0, 0)}.get(factor, (proved, promised))
