@@ -89,7 +89,7 @@ def level(run: Path) -> Figure:
     frames, said = (read_table(run / f"{name}.csv", name) for name in ("labels", "verdicts"))
     p = np.clip(said["probability_wrong"].astype(float), 1e-4, 1 - 1e-4)
     odds = np.log(p) - np.log1p(-p)
-    frozen = risk.from_toml(run / "calibration.toml").final.level
+    frozen = risk.read_calibration(run / "calibration.toml").final.level
     at = np.log(frozen) - np.log1p(-frozen)
     edges = np.linspace(-7.0, 9.5, 34)
     figure = Figure(figsize=(8.6, 3.4), layout="constrained")

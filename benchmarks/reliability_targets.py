@@ -129,12 +129,12 @@ def _settings(folder: Path) -> None:
 
 def _read_settings(folder: Path, out: Path) -> list[np.ndarray]:
     from taojax.config import from_toml
-    from taojax.risk import from_toml as calibration_of
+    from taojax.risk import read_calibration
     from taojax.runtime.sweep import expand, read_grid
 
     config = from_toml(folder / "config.toml")
     rows = expand(read_grid(folder / "grid.toml"), config)
-    final = calibration_of(folder / "calibration.toml").final
+    final = read_calibration(folder / "calibration.toml").final
     numbers = [float(v) for row in rows for v in row.values() if not isinstance(v, str)]
     return [np.array(numbers), final.mean, final.scale, final.weight]
 

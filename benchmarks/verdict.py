@@ -24,10 +24,10 @@ from taojax.audit import labels
 from taojax.audit import risk as judge
 from taojax.audit.calibration import fit_logistic
 from taojax.config import AuditConfig, VerdictConfig
+from taojax.decisions import POSE
 from taojax.risk import Calibration, Detector, Risk, at_most, probability_wrong
 from taojax.runtime import hindsight
 from taojax.runtime.maps import map_tables
-from taojax.verdicts import POSE
 
 RIDGE = 3.0
 """Precision of the pooled weights around zero, where the recordings weigh 1,000 together. From 1 to

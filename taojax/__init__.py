@@ -11,40 +11,65 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from taojax.config import Config, StreamConfig
+    from taojax.config import AuditConfig, Config, StreamConfig, VerdictConfig
+    from taojax.core.cost import Branch, BranchCost, CostParams, branch_cost
+    from taojax.core.refine import Refinement, refine
     from taojax.errors import ConfigError, InputError, TaojaxError
     from taojax.files.results import Results, read_run
+    from taojax.risk import Calibration, read_calibration
     from taojax.runtime.frames import STATUSES, Frame, StreamRecord
+    from taojax.runtime.hindsight import smooth
     from taojax.runtime.maps import MapTables, map_tables
+    from taojax.runtime.retrieval import retrieve
+    from taojax.runtime.score import verdicts
     from taojax.runtime.stream import StreamState, init, replay, step
 
 _HOMES = {
-    "taojax.config": ("Config", "StreamConfig"),
+    "taojax.config": ("AuditConfig", "Config", "StreamConfig", "VerdictConfig"),
+    "taojax.core.cost": ("Branch", "BranchCost", "CostParams", "branch_cost"),
+    "taojax.core.refine": ("Refinement", "refine"),
     "taojax.errors": ("ConfigError", "InputError", "TaojaxError"),
     "taojax.files.results": ("Results", "read_run"),
-    "taojax.runtime.maps": ("MapTables", "map_tables"),
+    "taojax.risk": ("Calibration", "read_calibration"),
     "taojax.runtime.frames": ("STATUSES", "Frame", "StreamRecord"),
+    "taojax.runtime.hindsight": ("smooth",),
+    "taojax.runtime.maps": ("MapTables", "map_tables"),
+    "taojax.runtime.retrieval": ("retrieve",),
+    "taojax.runtime.score": ("verdicts",),
     "taojax.runtime.stream": ("StreamState", "init", "replay", "step"),
 }  # fmt: skip
 
 __all__ = [
     "STATUSES",
+    "AuditConfig",
+    "Branch",
+    "BranchCost",
+    "Calibration",
     "Config",
     "ConfigError",
+    "CostParams",
     "Frame",
     "InputError",
     "MapTables",
+    "Refinement",
     "Results",
     "StreamConfig",
     "StreamRecord",
     "StreamState",
     "TaojaxError",
+    "VerdictConfig",
     "__version__",
+    "branch_cost",
     "init",
     "map_tables",
+    "read_calibration",
     "read_run",
+    "refine",
     "replay",
+    "retrieve",
+    "smooth",
     "step",
+    "verdicts",
 ]
 
 

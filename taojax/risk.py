@@ -262,7 +262,7 @@ def first_to_toml(detectors: Mapping[str, Detector]) -> str:
 
 
 def to_toml(calibration: Calibration) -> str:
-    """Return a calibration as text that `from_toml` reads back unchanged."""
+    """Return a calibration as text that `read_calibration` reads back unchanged."""
     lines = [
         "# Written by `taojax evaluate`; read by `taojax score --calibration FILE`.",
         f"schema = {SCHEMA}",
@@ -340,7 +340,7 @@ def _parse(text: str, where: str) -> Calibration:
     return Calibration(now, final, map_out, facts)
 
 
-def from_toml(path: Path) -> Calibration:
+def read_calibration(path: Path) -> Calibration:
     """Read a calibration file.
 
     Raises:

@@ -6,12 +6,12 @@ import pytest
 from taojax.audit import figures
 from taojax.audit.evaluate import evaluate
 from taojax.config import AuditConfig, Config, StreamConfig, to_toml
+from taojax.decisions import decide
 from taojax.files import records
 from taojax.files.specs import column_names
 from taojax.files.tables import table_text
 from taojax.risk import Calibration, Risk, for_run, shipped
 from taojax.risk import to_toml as calibration_toml
-from taojax.verdicts import decide
 
 N_CANDIDATES = 100
 

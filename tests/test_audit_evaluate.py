@@ -14,7 +14,7 @@ from taojax.audit.tables import to_latex, to_markdown
 from taojax.errors import InputError
 from taojax.files import records
 from taojax.files.tables import read_table
-from taojax.risk import from_toml
+from taojax.risk import read_calibration
 
 FILES = {
     "labels.csv", "verdicts.csv", "metrics.csv", "audit.json", "calibration.toml", "report.html",
@@ -166,7 +166,7 @@ def test_the_table_of_verdicts_counts_what_verdicts_and_truth_say(case):
         assert table["accepted"][at] == table["right"][at] + table["wrong"][at]
         assert table["max_wrong"][at] == 0.05
         assert table["promise"][at]
-    frozen = from_toml(run / "calibration.toml")
+    frozen = read_calibration(run / "calibration.toml")
     assert frozen.final.promise.replace(",", ";") == table["promise"][1]
     assert frozen.map_out is not None
 

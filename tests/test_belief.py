@@ -175,6 +175,18 @@ def test_without_evidence_nothing_is_certain(places):
     assert float(said[-1].off) == pytest.approx(balance, abs=0.02)
 
 
+def test_a_place_travelled_the_other_way_is_told_apart_from_here(places):
+    mass = np.zeros((2, M), np.float32)
+    mass[0, 10:13] = [0.1, 0.3, 0.1]
+    mass[1, 11] = 0.2
+    mass[0, 25] = 0.05
+    belief = Belief(jnp.asarray(mass), jnp.float32(0.25))
+    got = read(CONFIG, places, belief, jnp.zeros(3))
+    np.testing.assert_allclose([got.here, got.turned, got.off], [0.5, 0.2, 0.25], atol=1e-6)
+    assert got.map_index == 11
+    np.testing.assert_allclose(got.rival, 0.05 / 0.5, rtol=1e-5)
+
+
 def test_covariance_is_that_of_one_place_and_at_least_a_cell(places):
     said = drive(places, DRIVEN, [[t + 5] for t in range(30)])
     x, y, xy = np.asarray(said[-1].covariance)

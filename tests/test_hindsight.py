@@ -7,10 +7,10 @@ from conftest import loop, motions
 
 from taojax.config import VerdictConfig
 from taojax.datasets.simulate import WorldConfig, make_world
+from taojax.decisions import judged
 from taojax.risk import shipped
 from taojax.runtime import hindsight
 from taojax.runtime.maps import map_tables
-from taojax.verdicts import judged
 
 CONFIG = VerdictConfig(lag=4, window_frames=4)
 AT_ONCE = VerdictConfig(lag=0, window_frames=4)

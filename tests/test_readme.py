@@ -1,8 +1,10 @@
 """README, guide and numbers: their code runs as printed, their links and commands exist."""
 
+import dataclasses
 import re
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -61,6 +63,36 @@ def test_the_robot_program_runs_as_printed(rng):
     }
     exec(BLOCKS[1], names)
     assert taojax.STATUSES[int(names["record"].status)] == "warming_up"
+
+
+def test_the_library_is_used_as_printed(rng):
+    places, queries = loop(60), loop(60)[:24]
+    away = np.linalg.norm(queries[:, None, :2] - places[None, :, :2], axis=2)
+    like = np.exp(-away / 6.0)
+    names = {
+        "taojax": taojax, "jnp": jnp, "jax": jax, "dataclasses": dataclasses,
+        "map_poses": places, "map_descriptors": np.eye(60, dtype=np.float32) + 0.01,
+        "query_descriptors": like.astype(np.float32), "odometry": motions(queries),
+    }  # fmt: skip
+    exec(block("found = taojax.retrieve"), names)
+    assert names["may_enter"].shape == (24,)
+    assert set(names["closures"]) == set(column_names("verdicts"))
+    p = jnp.asarray(queries[:20, :2], jnp.float32)
+    names |= {"p": p, "q": p + 0.1, "params": taojax.CostParams(0.1, 100.0, 1e3, 3.0, 9.0)}
+    names |= {"similarity": jnp.ones(20), "has_anchor": jnp.ones(20, bool)}
+    names |= {"weight": jnp.full(20, 0.05), "start": jnp.zeros(3)}
+    exec(block("def literal"), names)
+    assert names["cost"].shape == (3, 24)
+    assert names["pull"].shape == (20, 2)
+    assert np.isfinite(names["pull"]).all()
+    assert names["best"].cost <= names["best"].start_cost
+
+
+def test_every_name_of_the_face_has_a_docstring_and_every_function_is_in_the_guide():
+    for name in set(taojax.__all__) - {"STATUSES", "__version__"}:
+        found = getattr(taojax, name)
+        assert found.__doc__, name
+        assert isinstance(found, type) or f"`{name}`" in GUIDE, name
 
 
 def test_every_verb_of_the_pages_exists(capsys):

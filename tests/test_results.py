@@ -16,7 +16,7 @@ from taojax.errors import InputError
 from taojax.files import records
 from taojax.files.results import SUMMARIES
 from taojax.files.specs import column_names
-from taojax.risk import from_toml
+from taojax.risk import read_calibration
 from taojax.runtime.score import score
 
 ANSWERED = ("probability_wrong_now", "probability_wrong")
@@ -102,7 +102,7 @@ def test_what_was_decided_at_run_time_comes_along(judged, data_folder, tmp_path)
         data_folder,
         tmp_path / "out",
         config,
-        calibration=from_toml(judged[0] / "calibration.toml"),
+        calibration=read_calibration(judged[0] / "calibration.toml"),
     )
     run = taojax.read_run(tmp_path / "out")
     assert (run.decisions.index.name, *run.decisions.columns) == column_names("verdicts")

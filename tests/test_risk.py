@@ -12,6 +12,7 @@ from taojax.audit import labels, tables
 from taojax.audit import risk as judge
 from taojax.audit.risk import Answers, Own
 from taojax.config import AuditConfig
+from taojax.decisions import decide, judged
 from taojax.errors import InputError
 from taojax.risk import (
     Calibration,
@@ -21,11 +22,10 @@ from taojax.risk import (
     at_most,
     for_run,
     foreign_map,
-    from_toml,
+    read_calibration,
     shipped,
     to_toml,
 )
-from taojax.verdicts import decide, judged
 
 SEEN = MapFacts("ab12", "ef56", 2.0, 0.9)
 
@@ -53,7 +53,7 @@ def written(folder, text):
 
 @pytest.mark.parametrize("calibration", [WHOLE, WHOLE._replace(fitted_on=None), shipped()])
 def test_a_file_gives_back_every_number(calibration, tmp_path):
-    again = from_toml(written(tmp_path, to_toml(calibration)))
+    again = read_calibration(written(tmp_path, to_toml(calibration)))
     same(again.now, calibration.now)
     same(again.final, calibration.final)
     same(again.map_out, calibration.map_out)
@@ -62,7 +62,7 @@ def test_a_file_gives_back_every_number(calibration, tmp_path):
 
 def test_quotes_in_words_do_not_break_the_file(tmp_path):
     odd = WHOLE._replace(final=FINAL._replace(promise='a "b" \\ c'))
-    assert from_toml(written(tmp_path, to_toml(odd))).final.promise == "a 'b' / c"
+    assert read_calibration(written(tmp_path, to_toml(odd))).final.promise == "a 'b' / c"
 
 
 OLD = """\
@@ -78,7 +78,7 @@ note = "of 0.1.0"
 
 def test_a_file_of_the_first_version_is_told_apart(tmp_path):
     with pytest.raises(InputError, match=r"0\.1\.0.*`taojax audit`") as told:
-        from_toml(written(tmp_path, OLD))
+        read_calibration(written(tmp_path, OLD))
     assert "\n" not in str(told.value)
 
 
@@ -108,7 +108,7 @@ def test_numbers_that_do_not_fit_are_refused_in_one_line(old, new, said, tmp_pat
     assert old in text
     broken = text.replace(old, new) if said != "poses_sha256" else text[: text.index("poses_")]
     with pytest.raises(InputError, match=re.escape(said)) as told:
-        from_toml(written(tmp_path, broken))
+        read_calibration(written(tmp_path, broken))
     assert "calibration.toml" in str(told.value)
     assert "\n" not in str(told.value)
 
@@ -172,11 +172,11 @@ def test_a_lone_answer_is_as_doubtful_as_three_times_what_the_filter_says(tmp_pa
     assert reasons[2].endswith("largest doubt: alone")
     path = tmp_path / "calibration.toml"
     path.write_text(to_toml(WHOLE._replace(final=lone)))
-    assert from_toml(path).final.alone == "alone"
-    assert from_toml(path).now.alone == ""
+    assert read_calibration(path).final.alone == "alone"
+    assert read_calibration(path).now.alone == ""
     path.write_text(path.read_text().replace('alone = "alone"', 'alone = "loud"'))
     with pytest.raises(InputError, match="unknown column 'loud'"):
-        from_toml(path)
+        read_calibration(path)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_a_lone_answer_is_as_doubtful_as_three_times_what_the_filter_says(tmp_pa
     ],
 )
 def test_a_calibration_knows_its_map(here, words, tmp_path):
-    said = foreign_map(from_toml(written(tmp_path, to_toml(WHOLE))).fitted_on, here)
+    said = foreign_map(read_calibration(written(tmp_path, to_toml(WHOLE))).fitted_on, here)
     assert said is None if words is None else words in said
 
 
@@ -237,6 +237,8 @@ def test_the_level_itself_is_accepted_and_a_half_is_not_rejected():
     got = decide(exact, signals, delayed)
     assert got["verdict"][0] == "accept"
     assert got["probability_wrong_now"][0] == pytest.approx(0.5)
+    below = exact._replace(final=FINAL._replace(levels=np.array([np.nan, p * (1 - 1e-9), 0.4])))
+    assert decide(below, signals, delayed)["verdict"][0] == "abstain"
 
 
 def test_reasons_name_the_probability_the_level_and_the_largest_doubt():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from taojax.core.anchors import look_up
-from taojax.runtime.maps import map_tables
+from taojax.runtime.maps import map_tables, rescale
 
 
 @pytest.mark.parametrize("spacing_m", [0.1, 1.0, 5.0])
@@ -23,3 +23,10 @@ def test_every_anchor_of_a_lattice_finds_itself():
     poses = np.c_[x.ravel(), y.ravel(), np.zeros(300)] * 2.0
     grid = map_tables(poses).places.grid
     np.testing.assert_array_equal(look_up(grid, grid.xy), np.arange(300))
+
+
+def test_similarity_lies_on_a_line_from_background_to_a_strong_match_and_ends_there():
+    scale = jnp.array([0.2, 0.6])
+    got = rescale(scale, jnp.array([[-1.0, 0.2, 0.3], [0.5, 0.6, 0.9]]))
+    np.testing.assert_allclose(got, [[0.0, 0.0, 0.25], [0.75, 1.0, 1.0]], atol=1e-6)
+    assert np.isfinite(rescale(jnp.array([0.5, 0.5]), jnp.array([0.4, 0.5, 0.6]))).all()

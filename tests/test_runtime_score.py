@@ -7,7 +7,7 @@ from judged import made_up
 from taojax.config import Config, StreamConfig, VerdictConfig, replace
 from taojax.files import records
 from taojax.files.specs import column_names
-from taojax.risk import MapFacts, from_toml, shipped
+from taojax.risk import MapFacts, read_calibration, shipped
 from taojax.runtime import hindsight
 from taojax.runtime.score import score
 from taojax.runtime.watch import load_map
@@ -87,7 +87,7 @@ def test_without_a_calibration_the_shipped_one_decides_and_the_seal_says_so(rng,
         "decided with the calibration that ships with taojax"
     )
     assert {"decisions.csv", "detector.toml", "delayed.csv"} <= set(run.manifest["sha256"])
-    assert from_toml(tmp_path / "run/detector.toml").final.levels.tolist() == (
+    assert read_calibration(tmp_path / "run/detector.toml").final.levels.tolist() == (
         shipped().final.levels.tolist()
     )
     assert set(run.decisions["verdict"][:2]) == {"abstain"}
@@ -110,6 +110,6 @@ def test_without_hindsight_both_verdicts_are_one(rng, tmp_path):
 def test_the_share_that_may_be_wrong_is_sealed_with_the_numbers(rng, tmp_path):
     folder = write_folder(tmp_path / "data", rng)
     score(folder, tmp_path / "run", replace(SMALL, {"max_wrong": 0.1}))
-    sealed = from_toml(tmp_path / "run/detector.toml")
+    sealed = read_calibration(tmp_path / "run/detector.toml")
     assert sealed.now.max_wrong == sealed.final.max_wrong == 0.1
     assert sealed.final.level == shipped().final.levels[3]

@@ -15,12 +15,12 @@ from taojax.audit.labels import Truth, read_truth
 from taojax.audit.own_map import in_truth
 from taojax.audit.summary_text import MAIN, count_files, find_words, metric_row
 from taojax.config import Config
+from taojax.decisions import decide, plain
 from taojax.files.pose_graph_io import as_verdicts
 from taojax.files.records import read_run
 from taojax.files.specs import write_atomically
 from taojax.files.tables import read_table, table_text
 from taojax.risk import to_toml
-from taojax.verdicts import decide, plain
 
 __all__ = ["Evaluation", "evaluate"]
 

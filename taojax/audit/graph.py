@@ -19,6 +19,7 @@ from taojax.audit.html import Page, grid, render
 from taojax.audit.labels import Truth, read_truth
 from taojax.audit.own_map import nearest_known
 from taojax.config import AuditConfig
+from taojax.decisions import plain
 from taojax.files.pose_graph_io import Verdicts, compose
 from taojax.files.records import Run
 from taojax.files.specs import write_atomically
@@ -33,7 +34,6 @@ from taojax.graph.methods import (
     optimise_few,
 )
 from taojax.graph.optimise import INSTALL, has_extra
-from taojax.verdicts import plain
 
 __all__ = [
     "Brief",

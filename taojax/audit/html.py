@@ -12,8 +12,8 @@ import numpy as np
 from taojax.audit.calibration import LOGISTIC
 from taojax.audit.figures import Picture
 from taojax.audit.opening import UNKNOWN, Drawing, Number
+from taojax.decisions import plain
 from taojax.files.specs import load_spec
-from taojax.verdicts import plain
 
 _ACCEPTED = "share of the map-out test frames with the verdict accept; abstaining accepts nothing"
 

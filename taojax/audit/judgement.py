@@ -10,9 +10,9 @@ from taojax.audit import calibration, labels, metrics, risk, tables
 from taojax.audit.conformal import Promise
 from taojax.audit.labels import Truth
 from taojax.config import Config
+from taojax.decisions import decide
 from taojax.files.records import Run, map_of, signal_names
 from taojax.risk import Calibration, Detector, for_run, probability, shipped
-from taojax.verdicts import decide
 
 
 class Judgement(NamedTuple):

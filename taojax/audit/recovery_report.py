@@ -28,10 +28,10 @@ from taojax.audit.recovery import (
     recovery_rows,
 )
 from taojax.config import Config, to_toml
+from taojax.decisions import plain
 from taojax.files.specs import write_atomically
 from taojax.files.tables import table_text
 from taojax.plots import CYCLE, IN_MAP, INK, MAP_OUT, PALE, STYLES, Mark
-from taojax.verdicts import plain
 
 BELIEFS = {
     "refused_wrong": Mark("wrong pose, not accepted", "#CC79A7", "s", 12),

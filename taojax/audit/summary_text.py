@@ -14,8 +14,8 @@ from taojax.audit.figures import Picture, csv_text, picture
 from taojax.audit.judgement import Evaluation, Judgement
 from taojax.audit.opening import TOO_SHORT, UNKNOWN, accepted_row, lines, sentence, summary_lines
 from taojax.audit.tables import NAN, Table, as_files, from_rows
+from taojax.decisions import plain
 from taojax.files.tables import table_text
-from taojax.verdicts import plain
 
 AMONG = {"FAR": "map-out", "FRR": "in-map"}
 """Rate -> the test frames among which it counts."""

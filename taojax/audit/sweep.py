@@ -15,12 +15,12 @@ from taojax.audit import calibration, labels, metrics, tables
 from taojax.audit.figures import Picture, as_files, csv_text, picture
 from taojax.audit.labels import read_truth
 from taojax.config import Config
+from taojax.decisions import plain
 from taojax.errors import InputError
 from taojax.files.records import INPUTS, digest_file, read_manifest
 from taojax.files.specs import column_names, read_npz, write_atomically
 from taojax.files.tables import read_table, table_text
 from taojax.plots import IN_MAP, MAP_OUT
-from taojax.verdicts import plain
 
 N_TOP = 10
 """Configurations in the printed table."""

@@ -10,10 +10,10 @@ from taojax.audit import calibration, metrics, risk
 from taojax.audit.conformal import Promise, conformal_threshold, realised
 from taojax.audit.labels import CalibrationSplit, Splits, TestSplit
 from taojax.config import AuditConfig
+from taojax.decisions import plain
 from taojax.files.specs import load_spec
 from taojax.files.tables import format_number, table_text
 from taojax.risk import Risk
-from taojax.verdicts import plain
 
 NAN = float("nan")
 FUSED = "fused"

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taojax.decisions import SILENT, STATUS_MEANS
 from taojax.risk import lone_doubt, terms
-from taojax.verdicts import SILENT, STATUS_MEANS
 
 if TYPE_CHECKING:
     from taojax.files.pose_graph_io import Verdicts

@@ -137,10 +137,12 @@ def _check_inputs(data: Path, manifest: Mapping[str, Any]) -> None:
 
 def _calibration(run: Path, sealed: "Run") -> Any:
     """Return the calibration that decided, where there was one."""
-    from taojax.risk import from_toml
+    from taojax.risk import read_calibration
 
     return (
-        from_toml(run / "detector.toml") if "detector.toml" in sealed.manifest["sha256"] else None
+        read_calibration(run / "detector.toml")
+        if "detector.toml" in sealed.manifest["sha256"]
+        else None
     )
 
 

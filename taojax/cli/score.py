@@ -37,7 +37,7 @@ class Score(Common):
 
 def run(args: Score) -> None:
     """Score a data folder and seal the result."""
-    from taojax.risk import from_toml
+    from taojax.risk import read_calibration
     from taojax.runtime.score import score
 
     check_layout(args.dataset, has_truth=False)
@@ -48,7 +48,7 @@ def run(args: Score) -> None:
         raise UsageError("--rival-logs counts from 0 and goes with --rivals")
     if args.rivals and rival_logs is None:
         rival_logs = sys.maxsize
-    calibration = None if args.calibration is None else from_toml(args.calibration)
+    calibration = None if args.calibration is None else read_calibration(args.calibration)
     manifest = score(
         args.dataset,
         out,

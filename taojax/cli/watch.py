@@ -46,7 +46,7 @@ def run(args: Watch) -> None:
     """Watch until stdin ends."""
     from taojax import config as settings
     from taojax.errors import ConfigError, UsageError
-    from taojax.risk import SHIPPED, for_run, foreign_map, from_toml, shipped
+    from taojax.risk import SHIPPED, for_run, foreign_map, read_calibration, shipped
     from taojax.runtime.watch import Watch as Watcher
     from taojax.runtime.watch import load_map
 
@@ -55,7 +55,7 @@ def run(args: Watch) -> None:
         config = settings.replace(config, {"max_wrong": args.max_wrong, "lag": args.lag})
     except ConfigError as error:
         raise UsageError(f"flag {error}") from error
-    own = None if args.calibration is None else from_toml(args.calibration)
+    own = None if args.calibration is None else read_calibration(args.calibration)
     used = for_run(own or shipped(), config.audit.max_wrong, config.verdict.lag)
     loaded = load_map(args.folder, config.stream)
     if said := foreign_map(used.fitted_on, loaded.facts):

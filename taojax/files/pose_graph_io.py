@@ -15,13 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from taojax.config import StreamConfig, from_toml
+from taojax.decisions import decide
 from taojax.errors import InputError
 from taojax.files.records import Run
 from taojax.files.specs import fail, read_text
 from taojax.files.tables import MOTION, POSE, read_frames, read_table, stacked
-from taojax.risk import Calibration, for_run
-from taojax.risk import from_toml as read_calibration
-from taojax.verdicts import decide
+from taojax.risk import Calibration, for_run, read_calibration
 
 __all__ = [
     "Graph",

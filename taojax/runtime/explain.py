@@ -17,12 +17,12 @@ from taojax.config import VerdictConfig, from_toml
 from taojax.core.belief import Places
 from taojax.core.path import Window, along
 from taojax.core.se2 import between, integrate, transform
+from taojax.decisions import SILENT
 from taojax.errors import InputError
 from taojax.files.records import Run
 from taojax.files.tables import MOTION, POSE, read_table, stacked
 from taojax.runtime import hindsight
 from taojax.runtime.maps import MapTables, map_tables
-from taojax.verdicts import SILENT
 
 TOLERANCE = 1e-4
 """A recomputed cost may differ from the sealed one by so much: the rounding of sums on another

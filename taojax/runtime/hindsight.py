@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
-from taojax.config import VerdictConfig
+from taojax.config import Config, VerdictConfig
 from taojax.core.belief import (
     Belief,
     Places,
@@ -39,6 +39,7 @@ from taojax.core.history import (
 from taojax.core.path import Support, Window, support
 from taojax.core.se2 import between, compose, inverse, transform
 from taojax.risk import Detector, first_look
+from taojax.runtime.frames import Frame, check_frame
 from taojax.runtime.maps import MapTables, rescale
 
 LISTED = 15
@@ -672,6 +673,30 @@ def replay_both(
     ]
     final = recall_log(config, first_look().final, gap_m, seen.odometry, _joined(finals, total))
     return Both(now, final)
+
+
+def smooth(
+    config: Config | VerdictConfig, tables: MapTables, frames: Frame, *, progress: bool = False
+) -> Both:
+    """Answer a log forwards, and again with the frames of a fixed lag behind each.
+
+    Args:
+        config: settings.
+        tables: the map.
+        frames: `(T, ...)` observations.
+        progress: draw a bar on stderr.
+
+    Returns:
+        `now` and `final` answers: pose (x [m], y [m], theta [rad]), map row, covariance [m^2] and
+        the `FEATURES` of each, NumPy.
+
+    Raises:
+        InputError: arrays of a wrong shape or type.
+    """
+    check_frame(frames, axes=1)
+    settings = config.verdict if isinstance(config, Config) else config
+    seen = clean(tables, *map(np.asarray, (frames.odometry, frames.index, frames.similarity)))
+    return replay_both(settings, tables, seen, progress=progress)
 
 
 def final_block(  # noqa: PLR0913 - a log and where to cut it

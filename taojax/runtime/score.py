@@ -15,20 +15,20 @@ from tqdm import tqdm
 
 from taojax import __version__
 from taojax.config import Config, StreamConfig, replace, to_toml
+from taojax.decisions import decide
 from taojax.errors import InputError
 from taojax.files.records import SealedTrack, code_digest, map_of, refuse_if_taken, write_run
 from taojax.files.specs import read_bytes
 from taojax.risk import SHIPPED, Calibration, for_run, foreign_map, shipped
 from taojax.risk import to_toml as calibration_toml
 from taojax.runtime import growing, hindsight
-from taojax.runtime.frames import STATUSES, Frame, StreamRecord
+from taojax.runtime.frames import STATUSES, Frame, StreamRecord, check_frame
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import Observations, load_observations
 from taojax.runtime.parallel import CUT, WHOLE, device_mesh, gather, place
 from taojax.runtime.retrieval import N_KEPT, retrieve
 from taojax.runtime.rivals import rival_tracks, sealed_track
 from taojax.runtime.stream import COMPILING, answered, init, literal, replay
-from taojax.verdicts import decide
 
 SAME = 1e-4
 """Costs nearer than this, relatively, differ by rounding alone."""
@@ -205,6 +205,39 @@ def signal_table(t_s: np.ndarray, records: StreamRecord) -> dict[str, np.ndarray
         "theta_rad": pose[:, 2],
         **{name: np.asarray(values) for name, values in records.signals.items()},
     }
+
+
+def verdicts(
+    config: Config,
+    tables: MapTables,
+    frames: Frame,
+    calibration: Calibration | None = None,
+    *,
+    progress: bool = False,
+) -> dict[str, np.ndarray]:
+    """Say of every frame of a log whether its answer may enter the graph, now and finally.
+
+    Args:
+        config: settings; the share of wrong answers is `config.audit.max_wrong`.
+        tables: the map.
+        frames: `(T, ...)` observations.
+        calibration: frozen numbers of an audit, from `read_calibration`; the shipped ones when
+            omitted.
+        progress: draw bars on stderr.
+
+    Returns:
+        The columns of data_specs/verdicts.toml, `(T,)` each; the same as `taojax score` seals.
+
+    Raises:
+        InputError: arrays of a wrong shape or type.
+    """
+    check_frame(frames, axes=1)
+    both = hindsight.smooth(config, tables, frames, progress=progress)
+    records = answered(config, replay_log(config, tables, frames, progress=progress), both.now)
+    table = signal_table(np.arange(float(len(frames.odometry))), records)
+    table |= hindsight.now_columns(both.now)
+    used = for_run(calibration or shipped(), config.audit.max_wrong, config.verdict.lag)
+    return decide(used, table, hindsight.delayed_columns(both.final))
 
 
 def facts_of(command: str, dataset: Path, seed: int) -> dict[str, Any]:

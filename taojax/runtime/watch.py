@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from taojax.config import Config, StreamConfig
+from taojax.decisions import SILENT, judged
 from taojax.errors import InputError
 from taojax.files.dataset_info import DESCRIPTORS
 from taojax.files.records import digest_file
@@ -30,7 +31,6 @@ from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import descriptor_names
 from taojax.runtime.retrieval import N_KEPT
 from taojax.runtime.stream import answered, init, literal, step
-from taojax.verdicts import SILENT, judged
 
 MOST_BYTES = 1 << 20
 """Longest line; what is longer is skipped up to its end, never held."""
