@@ -163,8 +163,7 @@ def oracle_alignment(data: DataSet, config: Config, tables: MapTables) -> np.nda
     """Return the cost along the true path, whatever the filter believed.
 
     In every frame the best anchor about the true place is taken: truncated Huber cost of its
-    distance plus 1 - similarity on the fixed scale, averaged over as many frames as `tao` looks
-    back.
+    distance plus 1 - similarity on the fixed scale, averaged over the window of the paper.
     """
     n_map = len(data.map_poses)
     low, high = np.asarray(tables.scale, float)
@@ -177,9 +176,8 @@ def oracle_alignment(data: DataSet, config: Config, tables: MapTables) -> np.nda
     r = np.hypot(gap[..., 0], gap[..., 1]) / tolerance
     residual = np.where(r <= 1.0, 0.5 * r**2, r - 0.5)
     cost = np.minimum(1.0, 0.5 * (residual + 1.0 - rows[:, :n_map]).min(axis=1))
-    n = hindsight.LONG_PAST * config.verdict.window_frames
     total, at = np.cumsum(np.append(0.0, cost)), np.arange(len(cost))
-    first = np.maximum(at - n, 0)
+    first = np.maximum(at + 1 - config.stream.window, 0)
     return (total[at + 1] - total[first]) / (at + 1 - first)
 
 
