@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.sets import DataSet
-from taojax import risk as detector
 from taojax.audit import calibration, labels, risk, sequential
 from taojax.baselines.models import Frames
 from taojax.config import Config
 from taojax.risk import for_run, probability_wrong, shipped
+from taojax.risk import probability as probability_map_out
 from taojax.runtime import hindsight
 from taojax.runtime.frames import Frame, StreamRecord
 from taojax.runtime.maps import LEAST_RANGE, MapTables, map_tables
@@ -209,7 +209,7 @@ def _ours(field: Field, run: Played) -> list[Entry]:
     features = {name: delayed[name] for name in base.columns}
     model = calibration.fit(field.split(features).calibration, base)
     believed = run.both.final.pose[:, :2].astype(float)
-    probability = log_odds(detector.probability(model, delayed))
+    probability = log_odds(probability_map_out(model, delayed))
     return [*found, Entry(FUSED, "ours", probability, believed, run.both_us)]
 
 

@@ -56,7 +56,7 @@ TITLES = {
     "tao": "**`tao`**",
     "single_view": "calibrated single view",
     "joint_features": "calibrated joint features, as the paper writes them",
-    "joint": "**calibrated joint (`probability_map_out`)**",
+    "fused": "**calibrated (`probability_map_out`)**",
 }
 
 PAPER = {
@@ -144,7 +144,7 @@ def measure(route: Route, settings: ProgressConfig, seed: int, config: Config) -
     for table in (judgement.metrics, beside):
         for at, signal in enumerate(table["signal"]):
             row = {column: values[at] for column, values in table.items()}
-            rows["joint" if signal == tables.FUSED else signal] = row
+            rows[signal] = row
     n_anchors = settings.n_anchors or len(route.map_rows)
     own = {"n_anchors": n_anchors, "row_m": settings.row_m, "seed": seed}
     return [rows[method] | own | {"method": method} for method in TITLES]

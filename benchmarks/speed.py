@@ -22,7 +22,7 @@ keeps its own kernel (120 -> 57 us, and a stall on a GPU); moments stacked into 
 copies cost what the sums did); in the filter matrix products instead of sums over 4,000 numbers
 (50 us slower).
 
-What did: one array for all signals, coordinates gathered one by one, lists and bytes in the rings,
+What did: one array for all signals, coordinates gathered one by one, lists and bytes in the window,
 map and settings closed over instead of handed in.
 """
 

@@ -28,7 +28,7 @@ nor sure."""
 
 
 class MapFacts(NamedTuple):
-    """Which map a detector was fitted on, told by what both sides can measure."""
+    """Which map a calibration was fitted on, told by what both sides can measure."""
 
     poses_sha256: str
     """Of map/poses.csv."""
@@ -65,14 +65,6 @@ class Detector(NamedTuple):
     """How it was fitted, in words."""
 
 
-def log_odds_terms(
-    detector: Detector, signals: Mapping[str, np.ndarray]
-) -> Float[np.ndarray, "t f"]:
-    """Return what each signal adds to the log odds of each frame above the mean in-map frame's."""
-    table = np.stack([np.asarray(signals[name], float) for name in detector.columns], axis=1)
-    return (table - detector.mean[None]) / detector.scale[None] * detector.weight[None]
-
-
 def probability(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
     """Return the probability of being off the map, frame by frame; no frame sees another.
 
@@ -80,9 +72,7 @@ def probability(detector: Detector, signals: Mapping[str, np.ndarray]) -> Float[
         detector: fitted numbers.
         signals: column -> (t,).
     """
-    # Summed by hand: a matrix product may round differently for other numbers of frames.
-    log_odds = np.sum(log_odds_terms(detector, signals), axis=1) + detector.bias
-    return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
+    return _probability(detector, signals)
 
 
 def foreign_map(then: MapFacts | None, here: MapFacts | None) -> str | None:
@@ -213,18 +203,23 @@ def for_run(calibration: Calibration, max_wrong: float, lag: int) -> Calibration
     return calibration._replace(now=now, final=final)
 
 
-def terms(risk: Risk, features: Mapping[str, np.ndarray]) -> Float[np.ndarray, "t f"]:
-    """Return what each feature adds to the log odds of being wrong above the pooled mean."""
-    table = np.stack([np.asarray(features[name], float) for name in risk.columns], axis=1)
-    return (table - risk.mean[None]) / risk.scale[None] * risk.weight[None]
+def terms(model: "Risk | Detector", features: Mapping[str, np.ndarray]) -> Float[np.ndarray, "t f"]:
+    """Return what each feature adds to the log odds above those of the mean it is measured from."""
+    table = np.stack([np.asarray(features[name], float) for name in model.columns], axis=1)
+    return (table - model.mean[None]) / model.scale[None] * model.weight[None]
+
+
+def _probability(
+    model: "Risk | Detector", features: Mapping[str, np.ndarray]
+) -> Float[np.ndarray, " t"]:
+    # Summed by hand: a matrix product may round differently for other numbers of frames.
+    odds = np.sum(terms(model, features), axis=1) + model.bias
+    return 1.0 / (1.0 + np.exp(-np.clip(odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
 
 
 def probability_wrong(risk: Risk, features: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:
     """Return the probability that each answer is wrong; of a lone one at least its own doubt."""
-    # Summed by hand: a matrix product may round differently for other numbers of frames.
-    odds = np.sum(terms(risk, features), axis=1) + risk.bias
-    p = 1.0 / (1.0 + np.exp(-np.clip(odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)))
-    return np.maximum(p, lone_doubt(risk, features))
+    return np.maximum(_probability(risk, features), lone_doubt(risk, features))
 
 
 def lone_doubt(risk: Risk, features: Mapping[str, np.ndarray]) -> Float[np.ndarray, " t"]:

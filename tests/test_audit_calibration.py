@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from taojax.audit import calibration, labels
-from taojax.risk import Detector, log_odds_terms, probability
+from taojax.risk import Detector, probability, terms
 
 NAMES = ("top1_w5", "tao", "entropy", "margin", "velocity", "sue")
 ONES = np.ones(len(NAMES))
@@ -133,7 +133,7 @@ def test_terms_are_told_from_the_mean_in_map_frame(rng):
     inside = split_of(signals, label)
     model = calibration.fit_plain(inside, NAMES)
     own = {name: values[inside.is_in] for name, values in inside.signals.items()}
-    np.testing.assert_allclose(log_odds_terms(model, own).mean(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(terms(model, own).mean(axis=0), 0.0, atol=1e-12)
 
 
 def slope(model, split, start, precision, *, firm, mean=None, scale=None):  # noqa: PLR0913

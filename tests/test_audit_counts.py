@@ -89,7 +89,7 @@ def test_both_tables_stand_in_the_run_folder_and_can_be_read_again(case):
     run, done = case
     for name in ("counts", "rates"):
         table = read_table(run / f"tables/{name}.csv", name)
-        made = getattr(counts, f"{name}_table")(done.judgement)
+        made = getattr(summary_text, f"{name}_table")(done.judgement)
         assert list(table) == list(made)
         assert (run / f"tables/{name}.tex").read_text().count("\\\\") == 1 + len(
             table["frames" if name == "counts" else "rate"]

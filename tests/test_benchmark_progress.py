@@ -52,11 +52,11 @@ def test_every_method_has_a_row_per_map_and_seed_and_one_at_another_unit(made):
 
 def test_what_is_fitted_is_measured_on_the_test_half_alone(made):
     table = read_table(made[0] / "progress.csv", "progress")
-    fitted = np.isin(list(table["method"]), ["single_view", "joint_features", "joint"])
+    fitted = np.isin(list(table["method"]), ["single_view", "joint_features", "fused"])
     assert np.isnan(table["auroc"][fitted]).all()
     assert np.isfinite(table["auroc"][~fitted]).all()
     assert np.isfinite(table["auroc_test"]).all()
-    single, joint = (table["auroc_test"][table["method"] == m] for m in ("single_view", "joint"))
+    single, joint = (table["auroc_test"][table["method"] == m] for m in ("single_view", "fused"))
     assert (single != joint).any()
 
 
@@ -107,7 +107,7 @@ def test_a_match_matrix_decides_where_a_query_is(tmp_path):
 
 def test_real_railway_places_keep_their_known_figures(shared, monkeypatch):
     monkeypatch.setattr(progress, "RIVALS", ())
-    ours = {name: name for name in ("top1", "tao", "single_view", "joint")}
+    ours = {name: name for name in ("top1", "tao", "single_view", "fused")}
     monkeypatch.setattr(progress, "TITLES", ours)
     name, folder, make = progress.RECIPES[0]
     config = Config(audit=AuditConfig(n_bootstrap=10))
@@ -117,4 +117,4 @@ def test_real_railway_places_keep_their_known_figures(shared, monkeypatch):
     assert (found["tao"]["n_out"], found["tao"]["n_in"]) == (302, 666)
     assert found["top1"]["auroc"] == pytest.approx(0.816, abs=0.002)
     assert found["tao"]["auroc"] > 0.98
-    assert found["joint"]["auroc_test"] > found["single_view"]["auroc_test"] + 0.1
+    assert found["fused"]["auroc_test"] > found["single_view"]["auroc_test"] + 0.1

@@ -30,14 +30,6 @@ def test_positions_far_outside_the_grid_have_no_anchor():
     np.testing.assert_array_equal(look_up(grid, far), [-1, -1, -1])
 
 
-DEGENERATE = {
-    "standing still": lambda w: eqx.tree_at(lambda x: x.p, w, jnp.zeros_like(w.p)),
-    "no similarity": lambda w: eqx.tree_at(lambda x: x.similarity, w, jnp.zeros_like(w.similarity)),
-    "no weight": lambda w: eqx.tree_at(lambda x: x.weight, w, jnp.zeros_like(w.weight)),
-    "far away": lambda w: eqx.tree_at(lambda x: x.p, w, w.p * 1e6),
-}
-
-
 @pytest.mark.parametrize("n", [3, 4, 12])
 def test_tiny_and_coincident_maps_have_tables(n):
     for poses in (loop(n), np.zeros((n, 3))):

@@ -569,7 +569,7 @@ def test_newer_verdicts_bring_poses_of_their_own(audited, monkeypatch):
         table["probability_wrong"] = np.full(n, 0.25)
         return table | {"probability_wrong_now": np.full(n, 0.5)}
 
-    monkeypatch.setattr(closures, "read_frames", newer)
+    monkeypatch.setattr(pose_graph_io, "read_frames", newer)
     got = answers.read_answers(audited / "run", run).answers
     np.testing.assert_allclose(got.final.pose[4], [1.0, 10.0, 0.1])
     np.testing.assert_allclose(got.now.pose[4], [2.0, 20.0, 0.2])

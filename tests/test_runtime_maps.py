@@ -1,4 +1,4 @@
-"""The map's look-up tables."""
+"""The prepared map: anchors find themselves, similarities get their fixed scale."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -101,7 +101,7 @@ def test_an_interrupted_sweep_goes_on_without_computing_again(world, tmp_path, m
 
         return evaluate
 
-    monkeypatch.setattr(sweep_run, "evaluate", stops_after(2))
+    monkeypatch.setattr(sweep, "evaluate", stops_after(2))
     line = fails(capsys, 130, *words)
     assert "run the same command again to continue" in line
     parts = {p.name: p.stat().st_mtime_ns for p in (out / "parts").glob("*.npz")}
@@ -113,7 +113,7 @@ def test_an_interrupted_sweep_goes_on_without_computing_again(world, tmp_path, m
     assert "another configuration" in fails(capsys, 3, *words, "--seed", "4")
     assert {n: (out / "parts" / n).stat().st_mtime_ns for n in parts} == parts
 
-    monkeypatch.setattr(sweep_run, "evaluate", stops_after(99))
+    monkeypatch.setattr(sweep, "evaluate", stops_after(99))
     assert main(words) == 0
     assert len(computed) == 4
     assert sorted(n for members, _ in computed for n in members) == list(range(8))

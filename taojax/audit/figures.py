@@ -16,8 +16,8 @@ from taojax.files.specs import load_spec
 TRACED = ("top1", "top1_w10", "velocity", "tao", "probability_wrong")
 """Signals that are drawn."""
 
-_VERDICT = {"probability_wrong": "probability_wrong"}
-"""Those of them that stand in verdicts.csv -> their column."""
+_OF_VERDICTS = ("probability_wrong",)
+"""Those of them that stand in verdicts.csv."""
 
 
 OURS = ("probability_wrong", "tao")
@@ -77,7 +77,7 @@ def retrieval(judgement: Judgement) -> Picture:
 
 def _traces(judgement: Judgement) -> dict[str, np.ndarray]:
     return {
-        name: judgement.verdicts[_VERDICT[name]] if name in _VERDICT
+        name: judgement.verdicts[name] if name in _OF_VERDICTS
         else judgement.signals[name].astype(float)
         for name in TRACED
     }  # fmt: skip

@@ -111,8 +111,8 @@ def names_of_signals() -> Mapping[str, str]:
         "probability_wrong_now": WRONG.format("causal"),
         "probability_wrong": WRONG.format("final"),
     }
-    plain = {name: PLAIN.format(", ".join(columns)) for name, columns in LOGISTIC.items()}
-    return found | own | plain | {"fused": FUSED}
+    logistic = {name: PLAIN.format(", ".join(columns)) for name, columns in LOGISTIC.items()}
+    return found | own | logistic | {"fused": FUSED}
 
 
 def names_of_tables(specs: Sequence[str]) -> dict[str, str]:
@@ -226,7 +226,7 @@ class Page(NamedTuple):
     """Sentences that should alarm; those not in `lead` stand below the openings."""
 
     route: str = ""
-    """JSON from `route.route_json`; empty = no section along the route."""
+    """JSON from `frame_explorer.route_json`; empty = no section along the route."""
 
 
 def number(value: float, column: Mapping[str, Any]) -> str:

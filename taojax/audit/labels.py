@@ -107,8 +107,8 @@ def split_frames(
         label: in_map, map_out or grey, per frame.
         calibration_share: share of all frames, from the start.
         gap_frames: one window. No literal signal of a test frame remembers a calibration frame;
-            joint ones fade over more frames, so the first of the test half are not independent of
-            the calibration half. Labels never reach a signal.
+            those of the filter fade over more frames, so the first of the test half are not
+            independent of the calibration half. Labels never reach a signal.
 
     Returns:
         The two tables; a very short run may leave the test table empty.

@@ -30,7 +30,7 @@ class Track(NamedTuple):
     """Larger = more likely off the map; NaN where the method was not run."""
 
     may_accept: Bool[np.ndarray, " t"]
-    """The method itself does not abstain: its status is ok and its pose fresh."""
+    """The method itself does not abstain: its status is ok, or it has a pose."""
 
     level: float | None = None
     """Threshold of the signal where the method brings its own; None = frozen on calibration

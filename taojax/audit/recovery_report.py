@@ -325,7 +325,7 @@ def _noticed(row: Row) -> str:
 
 
 OURS = ("final", "now", "tao")
-"""Methods that sentences tell of: both verdicts, and the paper's signal with joint association."""
+"""Methods that sentences tell of: both verdicts, and the off-map signal."""
 
 
 def _trial_words(rows: Sequence[Row], simulated: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""What was found, in plain sentences and in the layout of the paper."""
+"""What was found: every frame counted, plain sentences, the paper's tables over scenarios."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -66,7 +66,7 @@ def _counted(judgement: Judgement) -> list[tuple[str, str, str, Bool[np.ndarray,
     """Return name, what is counted, among what, and which frames of the run those are."""
     kinds, far, frr = _kinds(judgement), AMONG["FAR"], AMONG["FRR"]
     accepted, rejected = kinds["accepted"], kinds["rejected"]
-    left = judgement.verdicts["verdict"] == "abstain"
+    left = kinds["abstained"]
     is_above = judgement.verdicts["probability_map_out"] > judgement.detector.threshold
     rates = [
         (VERDICT_FAR, "accepted", far, accepted),

@@ -56,13 +56,13 @@ class Common(Compiling):
     """Map-out radius: truth beyond it of every map pose, metres."""
 
     window: Annotated[int | None, flag("N", "20")] = None
-    """Frames remembered."""
+    """Frames in the window of the literal cost."""
 
     branches: Annotated[int | None, flag("K", "100")] = None
-    """Hypotheses per frame."""
+    """Hypotheses of the literal cost per frame."""
 
     association: Annotated[Literal["rank", "joint"] | None, flag("rank|joint", "joint")] = None
-    """What a branch of the signal tao is."""
+    """What tao and the pose are of: the filter's answer (joint), or the paper's branches (rank)."""
 
     max_wrong: Annotated[float | None, flag("SHARE", "0.05")] = None
     """Share of the accepted answers that may be wrong."""

@@ -1,1 +1,1 @@
-"""Makes data folders: simulated worlds, and edits of existing maps."""
+"""Makes data folders: public sets, files as they are, simulated worlds, edits and kidnaps."""

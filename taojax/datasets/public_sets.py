@@ -26,11 +26,11 @@ from taojax.files.specs import column_names, fail, read_text
 from taojax.files.tables import read_table
 
 __all__ = [
-    "IMAGES",
     "KRI_CAMERA",
     "KRI_VARIANT",
     "ROBOTCAR_CAMERA",
     "STHEREO_CAMERA",
+    "VIVID_IMAGES",
     "check_sensors",
     "read_complex_urban",
     "read_frame_list",
@@ -41,9 +41,12 @@ __all__ = [
     "read_vivid",
 ]
 
+DIGITS = 19
+"""Of stamps in nanoseconds, which name frames in several sets."""
+
 KRI_CAMERA, KRI_VARIANT = "cam_3", "matlab_clahe2"
 
-NOTE = "route progress, no metric poses: frames are spread evenly over"
+KRI_NOTE = "route progress, no metric poses: frames are spread evenly over"
 
 
 def read_kri(
@@ -80,12 +83,12 @@ def read_kri(
     images = folder / camera / variant
     if not images.is_dir() and any(folder.glob("*.png")):
         images = folder
-    names, stamps = stamped_images(images, 19)
+    names, stamps = stamped_images(images, DIGITS)
     length = (n_rows or len(names)) - 1 if route_m is None else route_m
     x = np.linspace(0.0, float(length), len(names))
     flat = np.zeros_like(x)
     unit = "rows" if route_m is None else "m"
-    notes = [f"{NOTE} {length:g} {unit}"]
+    notes = [f"{KRI_NOTE} {length:g} {unit}"]
     unread = sorted(path.name for path in folder.glob("*.csv"))
     if unread:
         notes.append(f"{', '.join(unread)} was not read: what it holds is not confirmed")
@@ -93,16 +96,16 @@ def read_kri(
     return Session(names, drive, False, tuple(notes))
 
 
-IMAGES = "img/thermal_fieldscale_clahe"
+VIVID_IMAGES = "img/thermal_fieldscale_clahe"
 
-LEAST_M = 2.0
+VIVID_LEAST_M = 2.0
 """GPS wanders by less, so that a heading over this distance is one."""
 
 
 def read_vivid(
     folder: Path,
     *,
-    images: str = IMAGES,
+    images: str = VIVID_IMAGES,
     matching: Matching | None = None,
 ) -> Session:
     """Read one driving sequence of ViViD++.
@@ -125,7 +128,7 @@ def read_vivid(
     listed = folder / "thermal_gps_framelist.txt"
     track = folder / "gpslist.txt"
     is_shown = (folder / images).is_dir()
-    if not is_shown and images != IMAGES:
+    if not is_shown and images != VIVID_IMAGES:
         raise fail(folder / images, "no such folder of images", "choose another --frames")
     path = track if is_shown or not listed.is_file() else listed
     if path == track and not track.exists() and listed.is_file():
@@ -134,16 +137,16 @@ def read_vivid(
     check_unit(path, "t_s", table["t_s"], "seconds")
     xy = np.stack([table["x_m"], table["y_m"]], axis=1)
     flat, notes = checked_drive(path, table["t_s"], np.column_stack([xy, np.zeros(len(xy))]), 1.0)
-    theta = headings(flat.xyt[:, :2], LEAST_M)
+    theta = headings(flat.xyt[:, :2], VIVID_LEAST_M)
     drive = Trajectory(flat.t_s, np.column_stack([flat.xyt[:, :2], theta]))
     notes = (*notes, "the headings are derived from the positions")
     if not is_shown:
         return own_session([f"{t!r}.png" for t in drive.t_s.tolist()], drive, notes)
-    frames = _named(folder / images)
+    frames = _vivid_frames(folder / images)
     return matched_session(folder / images, frames, drive, matching or Matching(), notes)
 
 
-def _named(folder: Path) -> tuple[tuple[str, ...], Float[np.ndarray, " n"]]:
+def _vivid_frames(folder: Path) -> tuple[tuple[str, ...], Float[np.ndarray, " n"]]:
     """Return names `<seconds>.png` and their stamps [s], in time order."""
     found = []
     for path in folder.iterdir():
@@ -162,7 +165,7 @@ def _named(folder: Path) -> tuple[tuple[str, ...], Float[np.ndarray, " n"]]:
 
 ROBOTCAR_CAMERA = "stereo/centre"
 
-KEYS = ("timestamp", "northing", "easting", "down", "roll", "pitch", "yaw")
+ROBOTCAR_KEYS = ("timestamp", "northing", "easting", "down", "roll", "pitch", "yaw")
 """Columns that are used or guard those that are; a header must have them where the devkit does."""
 
 
@@ -213,7 +216,7 @@ def _read_gps(path: Path, spec: str) -> dict[str, np.ndarray]:
     header = [cell.strip() for cell in read_text(path).partition("\n")[0].split(",")]
     columns = column_names(spec)
     if "timestamp" in header:
-        for key in KEYS:
+        for key in ROBOTCAR_KEYS:
             at = columns.index(key)
             if at >= len(header) or header[at] != key:
                 what = f"row 1: column {at + 1} is not {key}"
@@ -244,7 +247,7 @@ def _robotcar_frames(
     return path, tuple(f"{stamp}.png" for stamp in stamps), stamps
 
 
-FRAMES = {
+MULRAN_FRAMES = {
     "mulran": ("sensor_data/Ouster", "sensor_data/radar/polar"),
     "complex_urban": ("image/stereo_left",),
 }
@@ -275,7 +278,7 @@ def read_mulran(
     Source:
         Kim et al., MulRan, ICRA 2020; thirteen columns, the 3x4 matrix row by row.
     """
-    return _read(folder, "mulran", frames, matching or Matching())
+    return _read_mulran(folder, "mulran", frames, matching or Matching())
 
 
 def read_complex_urban(
@@ -297,10 +300,10 @@ def read_complex_urban(
     Source:
         Jeong et al., Complex Urban Dataset, IJRR 2019; poses as in MulRan.
     """
-    return _read(folder, "complex_urban", frames, matching or Matching())
+    return _read_mulran(folder, "complex_urban", frames, matching or Matching())
 
 
-def _read(
+def _read_mulran(
     folder: Path,
     name: Literal["mulran", "complex_urban"],
     frames: str | None,
@@ -321,12 +324,12 @@ def _read(
     drive = Trajectory(drive.t_s, np.column_stack([drive.xyt[:, :2], theta]))
     notes = (*repeats, *turned)
     images = _mulran_frames(
-        folder, FRAMES[name] if frames is None else (frames,), frames is not None
+        folder, MULRAN_FRAMES[name] if frames is None else (frames,), frames is not None
     )
     if images is None:
         kept = np.concatenate([[True], np.diff(table["stamp_ns"]) > 0])
         return own_session([str(stamp) for stamp in table["stamp_ns"][kept]], drive, notes)
-    names, stamps = stamped_images(images, 19, (".bin", ".png"))
+    names, stamps = stamped_images(images, DIGITS, (".bin", ".png"))
     return matched_session(images, (names, stamps / 1e9), drive, matching, notes)
 
 
@@ -341,7 +344,6 @@ def _mulran_frames(folder: Path, usual: Sequence[str], is_wanted: bool) -> Path 
 STHEREO_CAMERA = "stereo_thermal_14_left"
 """The camera of the paper; thermal images of the right one have stamps of their own."""
 
-DIGITS = 19
 """Of UNIX time in nanoseconds."""
 
 SENSORS = ("data_stamp", "gps", "inspva", "xsens_imu")
@@ -413,7 +415,7 @@ def read_frame_list(path: Path) -> Session:
     """
     table = read_table(path, "sthereo_frame_list")
     names = [str(name) for name in table["thermal"]]
-    stamps = np.array([_stamp(path, at, names) for at in range(len(names))], np.int64)
+    stamps = np.array([_sthereo_stamp(path, at, names) for at in range(len(names))], np.int64)
     xy = np.stack([table["x_m"], table["y_m"]], axis=1)
     flat, repeats = checked_drive(path, stamps, np.column_stack([xy, np.zeros(len(xy))]), 1e-9)
     xy = flat.xyt[:, :2]
@@ -429,7 +431,7 @@ def read_frame_list(path: Path) -> Session:
     )
 
 
-def _stamp(path: Path, at: int, names: list[str]) -> int:
+def _sthereo_stamp(path: Path, at: int, names: list[str]) -> int:
     stamp = stamp_of(names[at], DIGITS)
     if stamp is None:
         row = row_of(path, len(names), at)

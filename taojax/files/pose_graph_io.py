@@ -232,6 +232,11 @@ def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([c * x + s * y, c * y - s * x, wrap(b[..., 2] - a[..., 2])], axis=-1)
 
 
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """Return the pose that undoes another; (..., 3) x [m], y [m], theta [rad]."""
+    return between(pose, np.zeros(3))
+
+
 def _chained(odometry: np.ndarray, known: np.ndarray, is_start: np.ndarray) -> np.ndarray:
     """Return a pose for every frame: the known ones, and odometry from the last of them.
 

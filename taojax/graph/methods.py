@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from taojax.files.pose_graph_io import between, compose
+from taojax.files.pose_graph_io import compose, inverse
 from taojax.graph.answers import Answers, Closure, Run2D, Stream
 from taojax.graph.consistency import consistent, exact_clique, greedy_clique
 from taojax.graph.odometry import DRIFTING, FEW, Chain, Noise, dead_reckoning, estimate, steps_m
@@ -71,10 +71,6 @@ class Outcome(NamedTuple):
     """Anything that a reader of its row must know."""
 
 
-def _inverse(pose: np.ndarray) -> np.ndarray:
-    return between(pose, np.zeros(3))
-
-
 def _cut(run: Run2D, first: int, end: int, noise: Noise) -> Chain:
     odometry, is_start = run.odometry[first:end], run.is_start[first:end].copy()
     is_start[:1] = True
@@ -109,7 +105,7 @@ def _anchors(run: Run2D, chain: Chain) -> tuple[np.ndarray, str]:
             out.append(np.zeros(3))
             said = said or "from the origin of the map, for want of any answer"
             continue
-        out.append(compose(final.pose[chosen], compose(_inverse(path[chosen]), path[first])))
+        out.append(compose(final.pose[chosen], compose(inverse(path[chosen]), path[first])))
         said = said if number else words
     return np.array(out), said
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from taojax.errors import MissingExtraError
-from taojax.files.pose_graph_io import between, compose, in_axes_of, wrap
+from taojax.files.pose_graph_io import between, compose, in_axes_of, inverse, wrap
 from taojax.graph.answers import Closure
 from taojax.graph.odometry import Chain, dead_reckoning
 
@@ -100,19 +100,13 @@ def _aligned(path: np.ndarray, rows: np.ndarray, closures: Sequence[Closure]) ->
     return compose(np.array([shift.real, shift.imag, angle]), path)
 
 
-def _inverse(pose: np.ndarray) -> np.ndarray:
-    """Return the pose that undoes another, (3,)."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
-
-
 def _joined(path: np.ndarray, rows: np.ndarray, closures: Sequence[Closure]) -> np.ndarray:
     """Return a path through every closure that follows odometry from the last one."""
     out = path.copy()
     ends = [*rows[1:].tolist(), len(path)]
     for number, (closure, row, end) in enumerate(zip(closures, rows.tolist(), ends, strict=True)):
         first = 0 if number == 0 else row
-        leads = compose(closure.pose, _inverse(path[row]))
+        leads = compose(closure.pose, inverse(path[row]))
         out[first:end] = compose(leads, path[first:end])
     return out
 

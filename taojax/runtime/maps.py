@@ -1,11 +1,11 @@
-"""The map, prepared once: anchors, spacing, and the grid that the filter looks up."""
+"""The map, prepared once: how alike its images look, spacing, anchors, the grid of the filter."""
 
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from taojax.config import StreamConfig
@@ -50,6 +50,11 @@ class MapView(NamedTuple):
     places apart."""
 
 
+def _sample_rows(xy: np.ndarray) -> Int[np.ndarray, " s"]:
+    """Return `SAMPLE` rows at most, spread over the map whatever the order of its rows."""
+    return _spread_rows(xy)[np.unique(np.linspace(0, len(xy) - 1, SAMPLE).astype(int))]
+
+
 def view_map(descriptors: np.ndarray, xy: np.ndarray, spacing_m: float) -> MapView:
     """Return scale and recall as the map alone shows them.
 
@@ -58,8 +63,7 @@ def view_map(descriptors: np.ndarray, xy: np.ndarray, spacing_m: float) -> MapVi
         xy: `(M, 2)` their positions [m].
         spacing_m: median distance between neighbouring images.
     """
-    chosen = np.unique(np.linspace(0, len(descriptors) - 1, SAMPLE).astype(int))
-    chosen = np.sort(_spread_rows(xy)[chosen])
+    chosen = np.sort(_sample_rows(xy))
     sample = jnp.asarray(normalise(descriptors[chosen]))
     parts = []
     for start in range(0, len(descriptors), 8192):
@@ -91,20 +95,19 @@ def rescale(scale: Float[Array, "2"], similarity: Float[Array, "*t c"]) -> Float
     return jnp.clip(scaled, 0.0, 1.0)
 
 
-def correlation_gaps(descriptors: np.ndarray, xy: np.ndarray, gap_m: float) -> float:
+def correlation_gaps(descriptors: np.ndarray, xy: np.ndarray, spacing_m: float) -> float:
     """Return how far the robot drives until an image looks new, as the map alone shows it.
 
     Args:
         descriptors: `(M, D)` of the map images, any scale.
         xy: `(M, 2)` their positions [m].
-        gap_m: median distance between neighbouring images.
+        spacing_m: median distance between neighbouring images.
 
     Returns:
         The distance, in gaps, at which the mean similarity has lost half of what neighbours have
         above the background of the whole map; 64 where it never does.
     """
-    chosen = np.unique(np.linspace(0, len(descriptors) - 1, SAMPLE).astype(int))
-    chosen = _spread_rows(xy)[chosen]
+    chosen = _sample_rows(xy)
     sample = jnp.asarray(normalise(descriptors[chosen]))
     low, total, count = 0.5, np.zeros(len(_EDGES) - 1), np.zeros(len(_EDGES) - 1)
     every, n_every = 0.0, 0
@@ -112,7 +115,7 @@ def correlation_gaps(descriptors: np.ndarray, xy: np.ndarray, gap_m: float) -> f
         block = normalise(descriptors[start : start + 8192])
         rows = np.asarray(similarities(jnp.asarray(block), sample))
         gap = np.asarray(xy)[chosen][:, None] - np.asarray(xy)[start : start + len(block)][None]
-        away = np.hypot(gap[..., 0], gap[..., 1]) / gap_m
+        away = np.hypot(gap[..., 0], gap[..., 1]) / spacing_m
         bins = np.digitize(away, _EDGES) - 1
         is_in = (away >= low) & (bins >= 0) & (bins < len(total))
         total += np.bincount(bins[is_in], weights=rows[is_in], minlength=len(total))

@@ -233,7 +233,7 @@ MOST_AT_ONCE = 32
 """Units under one `vmap` at most, where vmap is used at all."""
 
 MEMORY_BYTES = 1 << 30
-"""Tables and rings of the units under one `vmap` may take so much."""
+"""Tables and windows of the units under one `vmap` may take so much."""
 
 
 class RankLog(eqx.Module):
