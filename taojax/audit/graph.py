@@ -76,7 +76,7 @@ TITLES = {
     "pcm_exact": "PCM, exact",
     "ours": "ours, plain",
     "ours_gnc": "ours, GNC",
-    "ours_now": "ours of the moment, plain",
+    "ours_now": "ours now, plain",
     "ours_switch": "ours, probability as switch prior",
     ORACLE: "oracle, plain",
 }

@@ -314,45 +314,67 @@ def _one(row: Row, event: str) -> str:
     )
 
 
-def _noticed(row: Row) -> str:
-    if not row["trials"]:
-        return ""
-    return (
-        f" It refused a frame before accepting a right pose in {100 * row['noticed']:.1f} %, in the"
-        f" median at frame {_or_never(row['median_notice_frames'])}, and accepted a right pose"
-        f" again at frame {_or_never(row['median_accepted_again_frames'])}."
-    )
-
-
 OURS = ("final", "now", "tao")
 """Methods that sentences tell of: both verdicts, and the off-map signal."""
 
 
+def _each(values: Sequence[str]) -> str:
+    """Join what was found at each drift level, in the order of the levels."""
+    return " / ".join(values)
+
+
+def _levels(rows: Sequence[Row]) -> str:
+    """Say what one method reached at every drift level, in a sentence without its subject."""
+    trials = sorted({int(row["trials"]) for row in rows})
+    back = _each([f"{100 * row['recovered']:.1f}" for row in rows])
+    frames = _each([_or_never(row["median_frames"]) for row in rows])
+    wrong = [row["wrong_accepted_frames"] for row in rows]
+    said = (
+        f"back within the basin in {back} % of {' or '.join(map(str, trials))} kidnaps, in the"
+        f" median at frame {frames}"
+    )
+    if np.isnan(wrong).any():
+        return said
+    mean = _each([f"{value:.2f}" for value in wrong])
+    again = _each([_or_never(row["median_accepted_again_frames"]) for row in rows])
+    return (
+        f"{said}; {mean} wrong accepted frames a kidnap; in the median a right pose"
+        f" is accepted again at frame {again}"
+    )
+
+
+def _by_method(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    tried = [row for row in rows if row["trials"]]
+    return [
+        (name, found) for name in OURS if (found := [row for row in tried if row["method"] == name])
+    ]
+
+
 def _trial_words(rows: Sequence[Row], simulated: str) -> list[str]:
-    said = []
-    for row in (row for row in rows if row["method"] in OURS):
-        said.append(
-            f"{row['method']}, {row['drift']} drift ({simulated}): {_one(row, 'kidnap')}."
-            f"{_noticed(row)}"
-        )
-        others = [r for r in rows if r["drift"] == row["drift"] and r["method"] not in OURS]
-        others = [r for r in others if r["trials"]]
-        if others and row["method"] == OURS[-1]:
-            best = max(
-                others, key=lambda r: (r["recovered"], -np.nan_to_num(r["median_frames"], nan=1e9))
-            )
+    drifts = list(dict.fromkeys(row["drift"] for row in rows if row["trials"]))
+    if not drifts:
+        return []
+    said = [f"Trials with {simulated}; drift {_each(drifts)}."]
+    said += [f"{name}: {_levels(found)}." for name, found in _by_method(rows)]
+    for drift in drifts:
+        others = [
+            r for r in rows if r["drift"] == drift and r["method"] not in OURS and r["trials"]
+        ]
+        if others:
+            key = lambda r: (r["recovered"], -np.nan_to_num(r["median_frames"], nan=1e9))
             said.append(
-                f"{row['drift']} drift, best of {len(others)} others: {_one(best, 'kidnap')}."
+                f"{drift} drift, best of {len(others)} others: "
+                f"{_one(max(others, key=key), 'kidnap')}."
             )
     return said
 
 
 def _offset_words(rows: Sequence[Row]) -> list[str]:
     return [
-        f"{row['method']}, {row['drift']} drift (simulated), {row['offset']}: "
-        f"{_one(row, 'kidnap')}."
-        for row in rows
-        if row["method"] in OURS
+        f"{name}, {offset} (simulated): {_levels(found)}."
+        for offset in dict.fromkeys(row["offset"] for row in rows)
+        for name, found in _by_method([row for row in rows if row["offset"] == offset])
+        if name in ("final", "now")
     ]
 
 
@@ -383,7 +405,7 @@ def _cards(rows: Sequence[Row]) -> list[Cell]:
         Cell(
             f"{100 * row['recovered']:.1f} %",
             f"of {row['trials']} kidnaps recovered at {row['drift']} drift (final), median"
-            f" {_or_never(row['median_frames'])} frames",
+            f" {_way(row['median_frames'], row['median_m'])}",
             "recovery.csv",
         )
         for row in rows
