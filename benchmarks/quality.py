@@ -243,7 +243,7 @@ def to_markdown(rows: Sequence[Row]) -> str:
     parts.append(
         "The best rival is chosen per set after the fact, which favours it; the interval is a "
         "paired block bootstrap. `loss`: the whole interval lies below zero.\n\n"
-        f"`{ORACLES[0]}` averages the cost at the true places over three windows, so it "
+        f"`{ORACLES[0]}` averages the cost at the true places over one window, so it "
         f"still reacts late at seams and can be beaten there. `{ORACLES[1]}` knows the "
         "similarity histograms of both classes and filters them over time.\n"
     )

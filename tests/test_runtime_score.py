@@ -1,5 +1,6 @@
 """Odd but legal data folders: finite numbers and a status on every frame."""
 
+import jax.numpy as jnp
 import numpy as np
 from conftest import table, write_folder
 from judged import made_up
@@ -9,7 +10,10 @@ from taojax.files import records
 from taojax.files.specs import column_names
 from taojax.risk import MapFacts, read_calibration, shipped
 from taojax.runtime import hindsight
-from taojax.runtime.score import score
+from taojax.runtime.frames import Frame
+from taojax.runtime.maps import map_tables
+from taojax.runtime.observations import load_observations
+from taojax.runtime.score import candidates, score, verdicts
 from taojax.runtime.watch import load_map
 
 SMALL = Config(
@@ -32,6 +36,21 @@ def scored(folder, out):
     for name in ("probability_wrong", "probability_wrong_now"):
         assert np.isfinite(run.decisions[name]).all(), name
     return run
+
+
+def test_a_program_is_told_what_score_seals(rng, tmp_path):
+    folder = write_folder(tmp_path / "data", rng)
+    sealed = scored(folder, tmp_path / "run").decisions
+    known = load_observations(folder)
+    tables = map_tables(known.map_xyt, SMALL.stream, known.descriptors[0])
+    frames = Frame(*(jnp.asarray(part) for part in (known.odometry, *candidates(known))))
+    found = verdicts(SMALL, tables, frames)
+    assert found.keys() == sealed.keys()
+    for name, values in found.items():
+        if values.dtype == object:
+            assert values.tolist() == sealed[name].tolist(), name
+        else:
+            np.testing.assert_allclose(values, sealed[name], rtol=1e-6, atol=1e-8, err_msg=name)
 
 
 def test_twelve_map_frames_and_unnormalised_descriptors(rng, tmp_path):

@@ -145,6 +145,19 @@ def _log_odds(p: Array) -> Array:
     return jnp.log(p) - jnp.log1p(-p)
 
 
+def _disagreement(
+    config: VerdictConfig,
+    places: Places,
+    reading: Reading,
+    window: Window,
+    answers: Float[Array, "w 3"],
+) -> tuple[Float[Array, " w"], Float[Array, " w"]]:
+    """Return how far the frames' own answers lie from where an answer puts them, and may, gaps."""
+    said = transform(reading.pose[None], window.xy)
+    apart = jnp.sqrt(jnp.sum((answers[:, :2] - said) ** 2, axis=1)) / places.gap_m
+    return apart, config.near_gaps + config.drift * window.way_gaps
+
+
 def _features(  # noqa: PLR0913 - what one answer is tried on
     config: VerdictConfig,
     places: Places,
@@ -179,9 +192,7 @@ def _features(  # noqa: PLR0913 - what one answer is tried on
         return support(config, places.grid.xy, places.gap_m, reading.pose, own_window)
 
     found = jax.vmap(tried)(weight)
-    said = transform(reading.pose[None], window.xy)
-    tolerance = config.near_gaps + config.drift * window.way_gaps
-    apart = jnp.sqrt(jnp.sum((answers[:, :2] - said) ** 2, axis=1)) / places.gap_m
+    apart, tolerance = _disagreement(config, places, reading, window, answers)
     agree = jnp.sum(jnp.where(apart <= tolerance, weight[2], 0.0))
     return jnp.concatenate([
         jnp.stack([
@@ -230,11 +241,9 @@ def _alone(  # noqa: PLR0913 - what one answer is tried on
     left = jnp.flip(jnp.cumsum(jnp.flip(paces)))
     is_end = (jnp.arange(len(paces)) > here) & (left <= END_FRAMES + 1e-3)
     ending = jnp.where(is_end, paces, 0.0)
-    said = transform(reading.pose[None], window.xy)
-    apart = jnp.sqrt(jnp.sum((answers[:, :2] - said) ** 2, axis=1)) / places.gap_m
+    apart, tolerance = _disagreement(config, places, reading, window, answers)
     # Twice what one answer may be off: both ends are answers.
-    is_near = apart <= 2.0 * (config.near_gaps + config.drift * window.way_gaps)
-    confirmed = jnp.sum(jnp.where(is_near, ending, 0.0))
+    confirmed = jnp.sum(jnp.where(apart <= 2.0 * tolerance, ending, 0.0))
     is_named = (own < FARTHEST) | ((confirmed > 0.0) & (2.0 * confirmed >= jnp.sum(ending)))
     return jnp.where(is_named, 0.0, 1.0 - reading.here)
 
