@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from taojax.config import VerdictConfig
-from taojax.core.anchors import look_up
 from taojax.core.belief import (
     Belief,
     carried,
@@ -241,19 +240,15 @@ def dense(config, places, motion):
     for anchor in range(m):
         weight = np.exp(-0.5 * away[:, anchor] / variance)
         spread[anchor, near[:, anchor]] = weight / weight.sum()
-    out, find = np.zeros((2 * m + 1, 2 * m + 1)), jax.jit(look_up)
+    out = np.zeros((2 * m + 1, 2 * m + 1))
     c, s = np.cos(-motion[2]), np.sin(-motion[2])
     for anchor in range(m):
         face = np.array([[c, -s], [s, c]]) @ facing[anchor]
         step_xy = np.array([[face[0], -face[1]], [face[1], face[0]]]) @ motion[:2]
         for direction, sign in ((0, -1.0), (1, 1.0)):
             at = xy[anchor] + sign * step_xy
-            # The grid says whether there is any anchor, the nearest of all is where it came from.
             source = int(np.argmin(((xy - at) ** 2).sum(axis=1)))
-            if (
-                int(find(grid, jnp.asarray(at, jnp.float32))) < 0
-                or ((xy[source] - at) ** 2).sum() >= (config.reach_gaps * gap) ** 2
-            ):
+            if ((xy[source] - at) ** 2).sum() >= (config.reach_gaps * gap) ** 2:
                 continue
             same = direction if facing[source] @ face >= 0 else 1 - direction
             row = direction * m + anchor

@@ -14,7 +14,8 @@ def test_every_anchor_of_an_evenly_spaced_line_finds_itself(spacing_m, axis):
     poses = np.zeros((400, 3))
     poses[:, axis] = spacing_m * np.arange(400)
     tables = map_tables(poses)
-    found = look_up(tables.places.grid, jnp.asarray(poses[:, :2], jnp.float32))
+    found, away = look_up(tables.places.grid, *jnp.asarray(poses[:, :2].T, jnp.float32))
+    assert (away < 1e-6).all()
     np.testing.assert_array_equal(found, np.arange(400))
 
 
@@ -22,7 +23,7 @@ def test_every_anchor_of_a_lattice_finds_itself():
     x, y = np.meshgrid(np.arange(20.0), np.arange(15.0), indexing="ij")
     poses = np.c_[x.ravel(), y.ravel(), np.zeros(300)] * 2.0
     grid = map_tables(poses).places.grid
-    np.testing.assert_array_equal(look_up(grid, grid.xy), np.arange(300))
+    np.testing.assert_array_equal(look_up(grid, *grid.xy.T)[0], np.arange(300))
 
 
 def test_similarity_lies_on_a_line_from_background_to_a_strong_match_and_ends_there():

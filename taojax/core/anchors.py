@@ -1,6 +1,7 @@
 """The static map, prepared for look-ups: which anchor is near."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -17,8 +18,9 @@ class AnchorGrid(eqx.Module):
     facing: Float[Array, "m 2"]
     """The same as unit vectors."""
 
-    nearest: Int[Array, " cells"]
-    """Row-major grid: the anchor nearest to a cell's centre, -1 where none is in reach."""
+    nearest: Int[Array, "n cells"]
+    """Row-major grid: the anchors that may be the nearest one to a position in a cell, -1 where
+    there are fewer or none is in reach."""
 
     shape: Int[Array, "2"]
     """Cells along x and y."""
@@ -36,13 +38,37 @@ class AnchorGrid(eqx.Module):
     """Their squared distances [m^2]."""
 
 
-def look_up(grid: AnchorGrid, xy: Float[Array, "*n 2"]) -> Int[Array, "*n"]:
-    """Return the anchor nearest to each position, -1 where none is in reach."""
-    x = jnp.floor((xy[..., 0] - grid.corner[0]) / grid.cell_m)
-    y = jnp.floor((xy[..., 1] - grid.corner[1]) / grid.cell_m)
-    width, height = grid.shape[0].astype(xy.dtype), grid.shape[1].astype(xy.dtype)
-    is_on = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+def look_up(
+    grid: AnchorGrid, x: Float[Array, "*n"], y: Float[Array, "*n"]
+) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
+    """Return the anchor nearest to each position, and its squared distance [m^2].
+
+    Args:
+        grid: the map.
+        x: positions [m].
+        y: the same.
+
+    Returns:
+        Anchors, and distances that are infinite where none is in reach. What is nearest to a
+        position does not depend on how the map lies in its frame: verdicts must not.
+    """
+    column, row = (jnp.floor((at - low) / grid.cell_m) for at, low in zip((x, y), grid.corner))
+    width, height = grid.shape[0].astype(x.dtype), grid.shape[1].astype(x.dtype)
+    is_on = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     # Clip before the cast: a float beyond int32 has no defined integer.
-    column = jnp.where(is_on, x, 0.0).astype(jnp.int32)
-    row = jnp.where(is_on, y, 0.0).astype(jnp.int32)
-    return jnp.where(is_on, grid.nearest[column * grid.shape[1] + row], -1)
+    cell = jnp.where(is_on, column, 0.0).astype(jnp.int32) * grid.shape[1]
+    cell += jnp.where(is_on, row, 0.0).astype(jnp.int32)
+    # Coordinates are gathered one by one: pairs of them take ten times as long on a CPU. A loop,
+    # because XLA takes long to compile what is written out.
+    map_x, map_y = grid.xy[:, 0], grid.xy[:, 1]
+
+    def closer(best: tuple[Array, Array], listed: Array) -> tuple[tuple[Array, Array], None]:
+        other = listed[cell]
+        known = jnp.maximum(other, 0)
+        away = jnp.where(other >= 0, (map_x[known] - x) ** 2 + (map_y[known] - y) ** 2, jnp.inf)
+        is_closer = away < best[1]
+        return (jnp.where(is_closer, known, best[0]), jnp.minimum(away, best[1])), None
+
+    none = jnp.zeros(x.shape, jnp.int32), jnp.full(x.shape, jnp.inf, x.dtype)
+    anchor, away = jax.lax.scan(closer, none, grid.nearest)[0]
+    return anchor, jnp.where(is_on, away, jnp.inf)

@@ -81,25 +81,6 @@ def _spread(
     return spread / weight[None]
 
 
-def _nearest(
-    grid: AnchorGrid, start: Int[Array, "2 m"], at_x: Float[Array, "2 m"], at_y: Float[Array, "2 m"]
-) -> tuple[Int[Array, "2 m"], Float[Array, "2 m"]]:
-    """Return the nearest anchor among some anchors' neighbours, and its squared distance.
-
-    A cell of the grid names the anchor nearest to its centre; which one that is depends on how the
-    map lies in its frame, and verdicts must not.
-    """
-
-    def closer(best: tuple[Array, Array], neighbour: Array) -> tuple[tuple[Array, Array], None]:
-        other = neighbour[start]
-        away = (grid.xy[:, 0][other] - at_x) ** 2 + (grid.xy[:, 1][other] - at_y) ** 2
-        is_closer = away < best[1]
-        return (jnp.where(is_closer, other, best[0]), jnp.minimum(away, best[1])), None
-
-    first = start, jnp.full(start.shape, jnp.inf, at_x.dtype)
-    return jax.lax.scan(closer, first, grid.neighbour)[0]
-
-
 def predict(
     config: VerdictConfig, places: Places, belief: Belief, motion: Float[Array, "3"]
 ) -> Belief:
@@ -131,9 +112,8 @@ def predict(
     cos, sin = turned[:, 0], turned[:, 1]
     dx, dy = motion[0] * cos - motion[1] * sin, motion[0] * sin + motion[1] * cos
     before_x, before_y = jnp.stack([x - dx, x + dx]), jnp.stack([y - dy, y + dy])
-    source = look_up(grid, jnp.stack([before_x, before_y], axis=-1))
-    known, away = _nearest(grid, jnp.maximum(source, 0), before_x, before_y)
-    is_linked = (source >= 0) & (away < (config.reach_gaps * gap_m) ** 2)
+    known, away = look_up(grid, before_x, before_y)
+    is_linked = away < (config.reach_gaps * gap_m) ** 2
     # A loop driven the other way later has anchors that face against their neighbours.
     is_same = c[known] * cos[None] + s[known] * sin[None] >= 0
     direction = jnp.array([[0], [1]])

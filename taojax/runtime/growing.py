@@ -79,7 +79,8 @@ def _padded_grid(grid: AnchorGrid, m: int) -> AnchorGrid:
     away[0] = 0.0
     b = grid.neighbour.shape[0]
     neighbour[:b, :n], away[:b, :n] = grid.neighbour, grid.neighbour_m2
-    cells = capacity(grid.nearest.shape[0], LEAST_CELLS, CELLS_GROWTH)
+    cells = grid.nearest.shape[1]
+    more = capacity(cells, LEAST_CELLS, CELLS_GROWTH) - cells
     room = lambda leaf, fill: np.concatenate(
         [np.asarray(leaf), np.full((len(own), *leaf.shape[1:]), fill, np.float32)]
     )
@@ -87,9 +88,7 @@ def _padded_grid(grid: AnchorGrid, m: int) -> AnchorGrid:
         xy=jnp.asarray(room(grid.xy, FAR_M)),
         theta=jnp.asarray(room(grid.theta, 0.0)),
         facing=jnp.asarray(room(grid.facing, np.sqrt(0.5))),
-        nearest=jnp.asarray(np.pad(
-            grid.nearest, (0, cells - grid.nearest.shape[0]), constant_values=-1
-        )),
+        nearest=jnp.asarray(np.pad(grid.nearest, [(0, 0), (0, more)], constant_values=-1)),
         shape=grid.shape,
         corner=grid.corner,
         cell_m=grid.cell_m,

@@ -294,6 +294,19 @@ def advance(
     return State(belief, pending, past, answers, pace, weights, way), answer
 
 
+class Kept(eqx.Module):
+    """What the causal half leaves of frames that wait for their final answer."""
+
+    belief: Belief
+    """Once each was seen; a leading time axis where there are several."""
+
+    before: Float[Any, "*t 3"]
+    """Motion gathered before each."""
+
+    since: Float[Any, "*t 3"]
+    """Motion gathered after the last transition up to each."""
+
+
 class Block(eqx.Module):
     """Frames around some whose final answer is due: `n_past` before, then the block, then the lag.
 
@@ -305,11 +318,8 @@ class Block(eqx.Module):
     """Causal answers, map frame."""
 
     is_there: Bool[Any, " w"]
-    start: Belief
-    """Causal belief before the block's first frame."""
-
-    pending: Float[Any, "3"]
-    """And the motion gathered then."""
+    kept: Kept
+    """Of the block's own frames."""
 
 
 def block_frames(config: VerdictConfig) -> int:
@@ -330,46 +340,32 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
     Returns:
         One answer per frame of the block; what is said of padding means nothing.
     """
-    places, n = tables.places, block_frames(config)
+    places, n = tables.places, len(block.kept.since)
     ahead = jax.tree.map(lambda leaf: leaf[n_past:], (block.seen, block.is_there))
 
     def pace(pending: Array, frame: tuple[Seen, Array]) -> tuple[Array, tuple[Array, ...]]:
         seen, is_there = frame
         motion, is_due, after, weight = paced(config, places, pending, seen.odometry)
-        is_due = is_due & is_there
         weight = jnp.where(is_there, weight, 0.0)
-        after = jnp.where(is_there, after, pending)
-        return after, (motion, is_due, after, weight)
+        return jnp.where(is_there, after, pending), (motion, is_due & is_there, weight)
 
-    motion, is_due, since, weight = jax.lax.scan(pace, block.pending, ahead)[1]
+    motion, is_due, weight = jax.lax.scan(pace, block.kept.before[0], ahead)[1]
 
-    def forth(belief: Belief, frame: tuple) -> tuple[Belief, Belief]:
-        seen, motion, is_due, weight = frame
-        belief = carried(config, places, belief, motion, is_due)
-        belief = weigh(belief, seen.index, config.evidence * weight * seen.scaled)
-        return belief, belief
-
-    mine = jax.tree.map(lambda leaf: leaf[:n], (ahead[0], motion, is_due, weight))
-    forward = jax.lax.scan(forth, block.start, mine)[1]
-
-    def back(belief: Belief, frame: tuple) -> tuple[Belief, None]:
-        seen, motion, is_due, weight = frame
-        belief = weigh(belief, seen.index, config.evidence * weight * seen.scaled)
-        return carried_back(config, places, belief, motion, is_due), None
-
-    # One loop for both parts: what is kept of the frames after the block is not used.
+    # One loop for both parts: what is found of the frames after the block is not used.
     every = ahead[0], motion, is_due, weight
     nothing = uninformed(config, places.grid.xy.shape[0], places.n_known)
-    start, kept = nothing, jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape)), nothing)
+    room = jax.tree.map(lambda leaf: jnp.zeros((n, *leaf.shape)), nothing)
 
-    def back_kept(at: Array, carry: tuple[Belief, Belief]) -> tuple[Belief, Belief]:
-        belief, kept = carry
+    def back(at: Array, carry: tuple[Belief, Belief]) -> tuple[Belief, Belief]:
+        belief, found = carry
         row = is_due.shape[0] - 1 - at
         slot = jnp.where(row < n, row, n)
-        kept = jax.tree.map(lambda all_, one: all_.at[slot].set(one, mode="drop"), kept, belief)
-        return back(belief, jax.tree.map(lambda leaf: leaf[row], every))[0], kept
+        found = jax.tree.map(lambda all_, one: all_.at[slot].set(one, mode="drop"), found, belief)
+        seen, motion, due, weight = jax.tree.map(lambda leaf: leaf[row], every)
+        belief = weigh(belief, seen.index, config.evidence * weight * seen.scaled)
+        return carried_back(config, places, belief, motion, due), found
 
-    backward = jax.lax.fori_loop(0, is_due.shape[0], back_kept, (start, kept))[1]
+    backward = jax.lax.fori_loop(0, is_due.shape[0], back, (nothing, room))[1]
 
     # Poses of all frames in the frame of the block's first one: float32 stays exact.
     odometry = jnp.where(block.is_there[:, None], block.seen.odometry, 0.0)
@@ -409,7 +405,10 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
             _alone(config, places, reading, window, paces, here, block.answers, own),
         )  # fmt: skip
 
-    return jax.lax.map(lambda x: answered(*x), (jnp.arange(n), forward, backward, since[:n]))
+    kept = block.kept
+    return jax.lax.map(
+        lambda x: answered(*x), (jnp.arange(n), kept.belief, backward, kept.since)
+    )
 
 
 def cleaned(
@@ -466,32 +465,27 @@ class Both(NamedTuple):
 
 
 @eqx.filter_jit
-def advance_blocks(
+def advance_log(
     config: VerdictConfig, tables: MapTables, state: State, seen: Seen
-) -> tuple[State, Answer, tuple[Belief, Array]]:
-    """Run `advance` over some whole blocks.
+) -> tuple[State, Answer, Kept]:
+    """Run `advance` over some frames.
 
     Args:
         config: settings.
         tables: the map.
         state: before the first frame.
-        seen: `(blocks * n)` frames.
+        seen: `(T,)` frames.
 
     Returns:
-        The state after them, an answer per frame, and per block what `finish` starts from.
+        The state after them, an answer per frame, and what `finish` needs of each.
     """
-    n = block_frames(config)
 
-    def block(state: State, frames: Seen) -> tuple[State, tuple[Answer, tuple[Belief, Array]]]:
-        start = state.belief, state.pending
-        state, answers = jax.lax.scan(
-            lambda carry, frame: advance(config, tables, carry, frame), state, frames
-        )
-        return state, (answers, start)
+    def one(state: State, frame: Seen) -> tuple[State, tuple[Answer, Kept]]:
+        after, answer = advance(config, tables, state, frame)
+        return after, (answer, Kept(after.belief, state.pending, after.pending))
 
-    blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, n, *leaf.shape[1:]), seen)
-    state, (answers, starts) = jax.lax.scan(block, state, blocks)
-    return state, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), answers), starts
+    state, (answers, kept) = jax.lax.scan(one, state, seen)
+    return state, answers, kept
 
 
 class Reach(NamedTuple):
@@ -531,7 +525,7 @@ def cut(  # noqa: PLR0913 - a log and where to cut it
     config: VerdictConfig,
     seen: Seen,
     answers: np.ndarray,
-    start: tuple[Belief, Array | np.ndarray],
+    kept: Kept,
     at: int,
     back: int,
     ahead: int,
@@ -542,7 +536,7 @@ def cut(  # noqa: PLR0913 - a log and where to cut it
         config: settings.
         seen: the log, NumPy.
         answers: `(T, 3)` causal answers.
-        start: what `advance_blocks` kept of the block.
+        kept: of the block's frames.
         at: its first frame.
         back: how many frames its windows reach back, from `reach`.
         ahead: and ahead.
@@ -563,7 +557,7 @@ def cut(  # noqa: PLR0913 - a log and where to cut it
         return np.where(mask, leaf[row], fill).astype(leaf.dtype)
 
     frames = Seen(taken(seen.odometry, 0), taken(seen.index, -1), taken(seen.scaled, 0))
-    return Block(frames, taken(answers, 0), is_there, *start), side
+    return Block(frames, taken(answers, 0), is_there, kept), side
 
 
 CHUNK = 250
@@ -657,29 +651,38 @@ def replay_both(
     """
     n, total = block_frames(config), len(seen.odometry)
     width = n * min(max(1, CHUNK // n), -(-total // n))
-    state, nows, starts = init(config, tables), [], []
-    for low in range(0, total, width):
-        room = max(0, low + width - total)
-        leaves = ((seen.odometry, 0), (seen.index, -1), (seen.scaled, 0))
-        part = Seen(*(
-            jnp.asarray(np.concatenate(
-                [leaf[low : low + width], np.full((room, *leaf.shape[1:]), empty, leaf.dtype)]
-            )) for leaf, empty in leaves
-        ))  # fmt: skip
-        state, answers, kept = advance_blocks(config, tables, state, part)
-        nows.append(jax.tree.map(np.asarray, answers))
-        kept = jax.tree.map(np.asarray, kept)
-        starts += [jax.tree.map(lambda leaf, b=b: leaf[b], kept) for b in range(width // n)]
+    far = reach(config, tables.places, seen.odometry)
+    # The beliefs of a block wait until its lag has passed, and no longer: a long log on a large map
+    # would fill the memory.
+    state, nows, finals, waiting = init(config, tables), [], [], []
+    answers = np.zeros((total, 3), np.float32)
+    with tqdm(total=total, unit="frame", disable=not progress, leave=False) as bar:
+        for low in range(0, total, width):
+            room = max(0, low + width - total)
+            leaves = ((seen.odometry, 0), (seen.index, -1), (seen.scaled, 0))
+            part = Seen(*(
+                jnp.asarray(np.concatenate(
+                    [leaf[low : low + width], np.full((room, *leaf.shape[1:]), empty, leaf.dtype)]
+                )) for leaf, empty in leaves
+            ))  # fmt: skip
+            state, now, kept = advance_log(config, tables, state, part)
+            nows.append(jax.tree.map(np.asarray, now))
+            end = min(low + width, total)
+            answers[low:end] = nows[-1].pose[: end - low]
+            if config.lag:
+                kept = jax.tree.map(np.asarray, kept)
+                waiting += [
+                    (low + b, jax.tree.map(lambda leaf, b=b: leaf[b : b + n], kept))
+                    for b in range(0, end - low, n)
+                ]
+            while waiting and (end == total or waiting[0][0] + far.ahead[waiting[0][0]] < end):
+                at, mine = waiting.pop(0)
+                finals.append(final_block(config, tables, seen, answers, mine, at, far))
+            bar.update(end - bar.n)
     gap_m = float(tables.places.gap_m)
     now = recall_log(config, first_look().now, gap_m, seen.odometry, _joined(nows, total))
     if config.lag == 0:
         return Both(now, now)
-    far = reach(config, tables.places, seen.odometry)
-    said = {"unit": "block", "disable": not progress, "leave": False, "desc": "looking back"}
-    finals = [
-        final_block(config, tables, seen, now.pose, starts[at // n], at, far)
-        for at in tqdm(range(0, total, n), **said)
-    ]
     final = recall_log(config, first_look().final, gap_m, seen.odometry, _joined(finals, total))
     return Both(now, final)
 
@@ -713,12 +716,12 @@ def final_block(  # noqa: PLR0913 - a log and where to cut it
     tables: MapTables,
     seen: Seen,
     answers: np.ndarray,
-    start: tuple[Belief, Array | np.ndarray],
+    kept: Kept,
     at: int,
     far: Reach,
 ) -> Answer:
     """Answer the block that begins at a frame, finally; some of it may lie beyond the end."""
-    block, n_past = cut(config, seen, answers, start, at, int(far.far_back[at]), int(far.ahead[at]))
+    block, n_past = cut(config, seen, answers, kept, at, int(far.far_back[at]), int(far.ahead[at]))
     return jax.tree.map(np.asarray, finish(config, tables, block, n_past))
 
 
@@ -745,7 +748,7 @@ class Follower:
         self._config, self._tables = config, tables
         self._seen: list[Seen] = []
         self._now: list[Answer] = []
-        self._starts: list[tuple[Belief, Array]] = []
+        self._kept: list[Kept] = []
         self._first, self._due = 0, 0
         self.state = init(config, tables)
         self._first_look = {k: as_first_look(v) for k, v in first_look()._asdict().items()}
@@ -766,9 +769,7 @@ class Follower:
         Args:
             seen: one frame from `clean`, without a time axis.
         """
-        number = self._first + len(self._seen)
-        if number % block_frames(self._config) == 0:
-            self._starts.append((self.state.belief, self.state.pending))
+        before = self.state.pending
         self.state, answer = advance(self._config, self._tables, self.state, seen)
         one = self._asked(
             "now", np.asarray(seen.odometry)[None], jax.tree.map(lambda leaf: leaf[None], answer)
@@ -776,6 +777,7 @@ class Follower:
         answer = jax.tree.map(lambda leaf: leaf[0], one)
         self._seen.append(seen)
         self._now.append(answer)
+        self._kept.append(Kept(self.state.belief, before, self.state.pending))
         return answer, self._finished(is_over=False)
 
     def flush(self) -> list[Finished]:
@@ -785,7 +787,7 @@ class Follower:
     def _finished(self, *, is_over: bool) -> list[Finished]:
         config, n = self._config, block_frames(self._config)
         done = []
-        while self._starts:
+        while self._kept:
             at, last = self._due - self._first, len(self._seen) - 1
             if not is_over and last - at < config.lag:
                 break
@@ -795,11 +797,13 @@ class Follower:
             far = reach(config, self._tables.places, odometry)
             if at > last or (not is_over and at + int(far.ahead[at]) > last):
                 break
-            seen = jax.tree.map(lambda *leaves: np.stack(leaves), *self._seen)
+            stacked = lambda trees: jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+            seen, now = stacked(self._seen), stacked(self._now)
             seen = Seen(odometry, seen.index, seen.scaled)
-            now = jax.tree.map(lambda *leaves: np.stack(leaves), *self._now)
+            # A last block that is not full is filled up with what nobody reads.
+            mine = (self._kept[:n] + self._kept[-1:] * n)[:n]
             final = now if config.lag == 0 else final_block(
-                config, self._tables, seen, now.pose, self._starts[0], at, far
+                config, self._tables, seen, now.pose, stacked(mine), at, far
             )  # fmt: skip
             rows = slice(at, min(at + n, last + 1))
             of_final = slice(0, rows.stop - rows.start) if config.lag else rows
@@ -809,7 +813,7 @@ class Follower:
                 final = self._asked("final", odometry[rows], final)
             done.append(Finished(self._due, take(now, rows), final))
             self._due += n
-            self._starts.pop(0)
+            del self._kept[:n]
             spare = self._due - self._first - reach_frames(config)
             if spare > 0:
                 del self._seen[:spare], self._now[:spare]

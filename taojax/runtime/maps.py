@@ -141,8 +141,13 @@ def _spread_rows(xy: np.ndarray) -> np.ndarray:
 NEIGHBOURS = 12
 """Anchors that mass spreads to from each anchor."""
 
-ON_EDGES = 0.1
-"""Share of anchors that one corner must serve better than the other to be preferred."""
+LISTED = 4
+"""Anchors that a cell of the filter's grid lists at most. On eight recorded maps .5 % of the cells
+in reach are near to more, and list those that most of the cell is near to."""
+
+PROBES = 4
+"""Positions along each edge of a cell, its ends included, that are asked for their nearest
+anchor."""
 
 PLACES_REACH = 4.0
 """A cell of the filter's grid knows an anchor within so many gaps: twice as far as a transition
@@ -230,47 +235,55 @@ def capacity(n: int, least: int, growth: int) -> int:
     return least
 
 
-def _grid(poses: np.ndarray, spacing_m: float, reach: float) -> AnchorGrid:
+def _listed(tree: KDTree, centres: np.ndarray, cell_m: float, reach: float, n: int) -> np.ndarray:
+    """Return `(n, cells)` anchors that may be the nearest one to a position in each cell."""
+    k = min(NEIGHBOURS, tree.n)
+    distance, near = tree.query(centres, k=np.arange(1, k + 1), distance_upper_bound=reach)
+    known = np.flatnonzero(np.isfinite(distance[:, 0]))
+    edge = np.linspace(-0.5, 0.5, PROBES) * cell_m
+    probes = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
+    cells = np.full((n, len(centres)), -1, np.int32)
+    for start in range(0, len(known), 4096):
+        at = known[start : start + 4096]
+        away = np.asarray(tree.data)[np.minimum(near[at], tree.n - 1)] - centres[at, None]
+        apart = np.sum(away**2, axis=2)[:, :, None] - 2.0 * away @ probes.T
+        apart = np.where(near[at][:, :, None] < tree.n, apart, np.inf)
+        votes = np.sum(np.argmin(apart, axis=1)[:, None] == np.arange(k)[:, None], axis=2)
+        order = np.argsort(-votes, axis=1, kind="stable")[:, :n]
+        # After them what is nearest to the centre: a probe does not see all that lies beside it.
+        anchors = np.take_along_axis(near[at], order, 1)
+        cells[: order.shape[1], at] = np.where(anchors < tree.n, anchors, -1).T
+    return cells
+
+
+def _grid(poses: np.ndarray, spacing_m: float) -> AnchorGrid:
     xy = poses[:, :2]
     tree = KDTree(xy)
+    reach = PLACES_REACH * spacing_m
     low, high = xy.min(axis=0) - reach, xy.max(axis=0) + reach
     cell_m = max(spacing_m, float((high - low).max()) / MAX_CELLS)
-    low = _corner(tree, low, cell_m)
     shape = np.ceil((high - low) / cell_m).astype(int) + 1
     centres = [low[axis] + (np.arange(shape[axis]) + 0.5) * cell_m for axis in (0, 1)]
     points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1).reshape(-1, 2)
-    distance, nearest = tree.query(points, distance_upper_bound=reach)
+    is_coarse = cell_m > spacing_m
+    # From the corner of a coarse cell an anchor must be found as from that of a fine one.
+    reach += np.sqrt(0.5) * (cell_m - spacing_m)
+    listed = _listed(tree, points, cell_m, reach, NEIGHBOURS if is_coarse else LISTED)
     # Padded, because every length of this table is compiled for anew.
-    cells = np.full(capacity(len(points), LEAST_CELLS, CELLS_GROWTH), -1, np.int32)
-    cells[: len(points)] = np.where(np.isfinite(distance), nearest, -1)
-    n_neighbours = min(NEIGHBOURS, len(xy))
-    gap, neighbour = tree.query(xy, k=n_neighbours)
+    room = capacity(len(points), LEAST_CELLS, CELLS_GROWTH) - len(points)
+    gap, neighbour = tree.query(xy, k=min(NEIGHBOURS, len(xy)))
     gap, neighbour = gap.reshape(len(xy), -1).T, neighbour.reshape(len(xy), -1).T
     return AnchorGrid(
         xy=jnp.asarray(xy, jnp.float32),
         theta=jnp.asarray(poses[:, 2], jnp.float32),
         facing=jnp.asarray(np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], 1), jnp.float32),
-        nearest=jnp.asarray(cells),
+        nearest=jnp.asarray(np.pad(listed, [(0, 0), (0, room)], constant_values=-1)),
         shape=jnp.asarray(shape, jnp.int32),
         corner=jnp.asarray(low, jnp.float32),
         cell_m=jnp.asarray(cell_m, jnp.float32),
         neighbour=jnp.asarray(neighbour, jnp.int32),
         neighbour_m2=jnp.asarray(gap**2, jnp.float32),
     )
-
-
-def _corner(tree: KDTree, low: np.ndarray, cell_m: float) -> np.ndarray:
-    """Place the grid so that anchors find themselves.
-
-    Anchors of an evenly spaced, axis-aligned map may all lie on cell edges, as far from the centre
-    of their cell as their neighbours: half a cell further they are its centre.
-    """
-    xy, corners, found = np.asarray(tree.data, np.float32), (low, low - 0.5 * cell_m), []
-    for corner in corners:
-        cell = np.floor((xy - np.float32(corner)) / np.float32(cell_m))  # as `look_up` rounds
-        centre = corner + (cell + 0.5) * cell_m
-        found.append(np.mean(tree.query(centre)[1] == np.arange(len(xy))))
-    return corners[int(found[1] > found[0] + ON_EDGES)]
 
 
 def map_tables(
@@ -302,7 +315,7 @@ def map_tables(
         unit = float(np.clip(correlation_gaps(descriptors, poses[:, :2], step_m), 1.0, MOST_UNIT))
     return MapTables(
         places=Places(
-            grid=_grid(poses, step_m, PLACES_REACH * step_m),
+            grid=_grid(poses, step_m),
             gap_m=jnp.asarray(step_m, jnp.float32),
             unit_m=jnp.asarray(unit * step_m, jnp.float32),
             n_known=jnp.asarray(len(poses), jnp.float32),
