@@ -15,9 +15,10 @@ from taojax.cli.common import run_apart
 STARTS = """
 import sys
 from taojax.cli import child
-with child.start(sys.argv[1:]) as started:
-    print(started.pid, flush=True)
-    started.wait()
+started = child.start()
+started.give(sys.argv[1:])
+print(started.process.pid, flush=True)
+started.process.wait()
 """
 
 RUNS = """
@@ -90,6 +91,29 @@ def test_an_interrupt_of_the_parent_alone_ends_the_child_too(long_job, tmp_path)
 def test_an_exit_code_comes_back(capfd):
     assert child.run([["nonsense"]]) == 2
     assert "nonsense" in capfd.readouterr().err
+
+
+def test_verbs_run_one_after_another_in_as_few_interpreters_as_there_may_be(capfd, monkeypatch):
+    begun, start = [], child.start
+    monkeypatch.setattr(child, "start", lambda: begun.append(start()) or begun[-1])
+    assert child.run([["watch", "--help"], ["score", "--help"], ["--help"]], most=2) == 0
+    assert len(begun) == 2
+    assert all(one.process.poll() is not None for one in begun)
+    said = capfd.readouterr()
+    assert all(f"usage: taojax {verb}" in said.out for verb in ("watch", "score", "VERB"))
+    assert said.err == ""
+
+
+def test_a_child_that_dies_at_work_is_told_by_its_signal(long_job, monkeypatch):
+    start = child.start
+
+    def started():
+        one = start()
+        one.process.send_signal(signal.SIGKILL)
+        return one
+
+    monkeypatch.setattr(child, "start", started)
+    assert child.run([long_job]) == -signal.SIGKILL
 
 
 def test_after_a_failure_no_other_is_begun_and_the_others_end(long_job, tmp_path, capfd):

@@ -52,7 +52,8 @@ def look_up(
         Anchors, and distances that are infinite where none is in reach. What is nearest to a
         position does not depend on how the map lies in its frame: verdicts must not.
     """
-    column, row = (jnp.floor((at - low) / grid.cell_m) for at, low in zip((x, y), grid.corner))
+    column = jnp.floor((x - grid.corner[0]) / grid.cell_m)
+    row = jnp.floor((y - grid.corner[1]) / grid.cell_m)
     width, height = grid.shape[0].astype(x.dtype), grid.shape[1].astype(x.dtype)
     is_on = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     # Clip before the cast: a float beyond int32 has no defined integer.

@@ -406,9 +406,7 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
         )  # fmt: skip
 
     kept = block.kept
-    return jax.lax.map(
-        lambda x: answered(*x), (jnp.arange(n), kept.belief, backward, kept.since)
-    )
+    return jax.lax.map(lambda x: answered(*x), (jnp.arange(n), kept.belief, backward, kept.since))
 
 
 def cleaned(

@@ -238,7 +238,8 @@ def capacity(n: int, least: int, growth: int) -> int:
 def _listed(tree: KDTree, centres: np.ndarray, cell_m: float, reach: float, n: int) -> np.ndarray:
     """Return `(n, cells)` anchors that may be the nearest one to a position in each cell."""
     k = min(NEIGHBOURS, tree.n)
-    distance, near = tree.query(centres, k=np.arange(1, k + 1), distance_upper_bound=reach)
+    found = tree.query(centres, k=k, distance_upper_bound=reach)
+    distance, near = (np.reshape(part, (-1, k)) for part in found)
     known = np.flatnonzero(np.isfinite(distance[:, 0]))
     edge = np.linspace(-0.5, 0.5, PROBES) * cell_m
     probes = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
