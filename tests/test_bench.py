@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import loop
 
 from taojax.baselines.paper_cost import numpy_cost, svd_cost
 from taojax.cli import main
@@ -72,6 +73,19 @@ def test_rows_are_written_as_the_contract_says(tmp_path):
     bench.write_rows(ROWS, tmp_path / "new" / "bench.csv")
     lines = (tmp_path / "new" / "bench.csv").read_text().splitlines()
     assert lines == ["name,value,unit", "numpy_over_step_rank,5,x", "step_rank_p50_us,400,us"]
+
+
+def test_watch_is_timed_from_line_to_answer(tmp_path):
+    poses = np.column_stack([np.arange(12.0), loop(12)])
+    np.savetxt(tmp_path / "poses.csv", poses, delimiter=",", header="t_s,x_m,y_m,theta_rad",
+               comments="")  # fmt: skip
+    line = b'{"odometry": [1, 0, 0], "index": [3], "similarity": [0.5]}'
+    ready, *rest = bench_fresh.watched(tmp_path, [line] * 30)
+    assert (ready.name, ready.unit) == ("watch_ready_s", "s")
+    assert [row.name for row in rest] == ["watch_p50_ms", "watch_p99_ms"]
+    assert 0 < rest[0].value <= rest[1].value < 1e3 * ready.value
+    with pytest.raises(RuntimeError, match="ended at line 1"):
+        bench_fresh.watched(tmp_path / "nowhere", [line])
 
 
 def test_bench_never_writes_over_a_run_and_needs_its_baseline(tmp_path, capsys):

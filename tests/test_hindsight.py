@@ -71,7 +71,9 @@ def streamed(config, tables, parts):
     seen, follower = hindsight.clean(tables, *parts), hindsight.Follower(config, tables)
     now, done, delay = [], [], {}
     for t in range(len(seen.odometry)):
-        answer, finished = follower.push(jax.tree.map(lambda leaf, t=t: leaf[t], seen))
+        answer = follower.push(jax.tree.map(lambda leaf, t=t: leaf[t], seen))
+        finished = follower.finished()
+        assert follower.finished() == []
         now.append(answer)
         done += finished
         delay |= {block.first: t - block.first for block in finished}
@@ -117,6 +119,7 @@ def test_a_follower_forgets_what_no_window_reaches(tables, rng):
     held = []
     for t in range(3 * T):
         follower.push(jax.tree.map(lambda leaf, t=t: leaf[t % T], seen))
+        follower.finished()
         held.append(len(follower._seen))
     most = hindsight.reach_frames(CONFIG) + hindsight.LONGEST * CONFIG.lag + 2
     assert max(held) <= most

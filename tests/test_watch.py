@@ -115,9 +115,9 @@ def test_a_final_line_comes_a_lag_later_and_the_last_ones_with_the_end(folder, t
     watcher = Watch(CONFIG, tables, CALIBRATION)
     due = {}
     for t, line in enumerate((folder / "feed.jsonl").read_bytes().splitlines()):
-        now, *finals = watcher.answer(line)
+        now = watcher.answer(line)
         assert (now["kind"], now["frame"]) == ("now", t)
-        for row in finals:
+        for row in watcher.finals():
             assert row["kind"] == "final"
             due[row["frame"]] = t - row["frame"]
     rest = watcher.flush()
@@ -259,6 +259,7 @@ def test_nothing_is_compiled_once_lines_come(folder, tables):
     before, many = sizes(), hindsight.finish._cached._cache_size()
     for line in (folder / "feed.jsonl").read_bytes().splitlines()[:20]:
         watcher.answer(line)
+        watcher.finals()
     assert sizes() == before
     assert hindsight.finish._cached._cache_size() == many
 

@@ -7,7 +7,10 @@ whatever works on whole logs as the best of several repeats.
 import csv
 import gc
 import importlib.util
+import itertools
+import json
 import os
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,10 +25,19 @@ from taojax.baselines.mht import MhtParams, mht
 from taojax.baselines.models import Frames
 from taojax.baselines.paper_cost import numpy_cost, svd_cost
 from taojax.baselines.topometric import topometric
-from taojax.config import StreamConfig
+from taojax.config import StreamConfig, VerdictConfig
 from taojax.core.cost import Branch, CostParams, branch_cost
 from taojax.errors import GateError, InputError
-from taojax.runtime.bench_fresh import Row, best_us, first_steps, imports, installed, peak_mb
+from taojax.runtime import hindsight
+from taojax.runtime.bench_fresh import (
+    Row,
+    best_us,
+    first_steps,
+    imports,
+    installed,
+    peak_mb,
+    watched,
+)
 from taojax.runtime.frames import Frame
 from taojax.runtime.maps import map_tables
 from taojax.runtime.retrieval import normalise, prepare, top_k
@@ -36,6 +48,9 @@ K, N = 100, 20
 
 MAP_SHAPE = 2000, 8448
 """Places and width of the descriptors, as a SALAD map has them."""
+
+INPUTS = "odometry", "index", "similarity"
+"""Of a frame, as `taojax watch` reads it."""
 
 WINDOW_PARAMS = CostParams(1.0, 1.0, 112.5, 5.0, 15.0)
 
@@ -123,6 +138,28 @@ def _stream(drive: Drive, association: str, *, n_calls: int, repeats: int) -> li
     ]
 
 
+def _finals(drive: Drive, repeats: int) -> Row:
+    """Time causal and final answers of a whole log; us per frame."""
+    tables = map_tables(drive.map_poses, None, drive.map_descriptors)
+    seen = hindsight.clean(tables, drive.odometry, drive.index, drive.similarity)
+    work = lambda: hindsight.replay_both(VerdictConfig(), tables, seen)
+    return Row("final_us", best_us(work, repeats, len(drive.index)), "us")
+
+
+def _watch(drive: Drive, n_frames: int) -> list[Row]:
+    """Time `taojax watch` on the first frames."""
+    frames = zip(drive.odometry, drive.index, drive.similarity, strict=True)
+    lines = [
+        json.dumps({name: leaf.tolist() for name, leaf in zip(INPUTS, frame, strict=True)}).encode()
+        for frame in itertools.islice(frames, n_frames)
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        poses = np.column_stack([np.arange(len(drive.map_poses)), drive.map_poses])
+        header = "t_s,x_m,y_m,theta_rad"
+        np.savetxt(f"{folder}/poses.csv", poses, "%.9g", ",", header=header, comments="")
+        return watched(Path(folder), lines)
+
+
 def _rivals(drive: Drive, n_frames: int) -> list[Row]:
     """Time systems of their own on the same frames; us per frame."""
     frames, few = drive.first(n_frames), drive.first(min(n_frames, 60))
@@ -183,6 +220,7 @@ def _ratios(rows: Sequence[Row]) -> list[Row]:
         "numpy_over_step_rank": ("numpy_rank_us", "step_rank_p50_us"),
         "numpy_over_step_joint": ("numpy_rank_us", "step_joint_p50_us"),
         "topometric_over_replay_joint": ("topometric_us", "replay_joint_us"),
+        "topometric_over_final": ("topometric_us", "final_us"),
         "mht_over_replay_joint": ("mht_bounded_us", "replay_joint_us"),
     }
     return [Row(name, at[over] / at[under], "x") for name, (over, under) in pairs.items()]
@@ -205,6 +243,7 @@ def measure(drive: Drive, *, quick: bool, say: Callable[[str], None]) -> list[Ro
     for association in ("rank", "joint"):
         say(f"step and replay, {association}")
         rows += _stream(drive, association, n_calls=n_calls, repeats=repeats)
+    rows.append(_finals(drive, repeats))
     say("rivals")
     rows += _rivals(drive, 60 if quick else 300)
     say(f"retrieval, {MAP_SHAPE[0]} x {MAP_SHAPE[1]}")
@@ -213,6 +252,8 @@ def measure(drive: Drive, *, quick: bool, say: Callable[[str], None]) -> list[Ro
     if not quick:
         say("imports and first step in a fresh interpreter")
         rows += [*imports(), *first_steps()]
+        say("watch, through its pipe")
+        rows += _watch(drive, 300)
     return [*rows, *installed(), Row("peak_memory_mb", peak_mb(), "MB")]
 
 

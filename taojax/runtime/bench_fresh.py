@@ -7,12 +7,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from taojax.files import specs
 
@@ -70,6 +71,10 @@ N_IMPORTS = 3
 """The fastest counts: the first one also writes bytecode and fills the cache of the disk."""
 
 
+WATCH_PAUSE_S = 0.02
+"""Between two frames: robots look a few times a second, and what is final is found in between."""
+
+
 def _seconds(code: str, **environment: str) -> float:
     """Return the number that some code prints last in an interpreter of its own."""
     done = subprocess.run(
@@ -99,6 +104,42 @@ def first_steps() -> list[Row]:
             Row(name, _seconds(FIRST_STEP, **known), "s")
             for name in ("first_step_cold_s", "first_step_cached_s")
         ]
+
+
+def watched(folder: Path, lines: Sequence[bytes]) -> list[Row]:
+    """Time `taojax watch` from outside: from a line on its stdin to the answer on its stdout.
+
+    Args:
+        folder: with poses.csv of the map.
+        lines: one frame each; the first tenth warms up.
+
+    Returns:
+        `watch_ready_s`, from the start of the process to its first answer, and quantiles.
+    """
+    began, spent = time.perf_counter(), []
+    command = [sys.executable, "-m", "taojax", "watch", str(folder)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as watch:
+        assert watch.stdin is not None  # noqa: S101 - asked for above
+        assert watch.stdout is not None  # noqa: S101
+        for number, line in enumerate(lines):
+            start = time.perf_counter() if number else began
+            watch.stdin.write(line + b"\n")
+            watch.stdin.flush()
+            # Final lines come after the answer; those of the frames before belong to nobody here.
+            while f'"kind": "now", "frame": {number},'.encode() not in (
+                answer := watch.stdout.readline()
+            ):
+                if not answer:
+                    raise RuntimeError(f"taojax watch {folder} ended at line {number + 1}")
+            spent.append(time.perf_counter() - start)
+            time.sleep(WATCH_PAUSE_S)
+        watch.stdin.close()
+        watch.stdout.read()
+    warm = np.array(spent[len(spent) // 10 :])
+    rows = [Row(f"watch_p{q}_ms", float(np.quantile(warm, q / 100)) * 1e3, "ms") for q in (50, 99)]
+    return [Row("watch_ready_s", spent[0], "s"), *rows]
 
 
 def _bytes_below(folder: Path) -> int:

@@ -761,8 +761,8 @@ class Follower:
         )  # fmt: skip
         return jax.tree.map(np.asarray, answers)
 
-    def push(self, seen: Seen) -> tuple[Answer, list[Finished]]:
-        """Take in one frame; return its causal answer, and the blocks that are final now.
+    def push(self, seen: Seen) -> Answer:
+        """Take in one frame and return its causal answer.
 
         Args:
             seen: one frame from `clean`, without a time axis.
@@ -776,7 +776,11 @@ class Follower:
         self._seen.append(seen)
         self._now.append(answer)
         self._kept.append(Kept(self.state.belief, before, self.state.pending))
-        return answer, self._finished(is_over=False)
+        return answer
+
+    def finished(self) -> list[Finished]:
+        """Return the blocks that have become final since it was last asked."""
+        return self._finished(is_over=False)
 
     def flush(self) -> list[Finished]:
         """Return what is left when the stream has ended: what follows will never be known."""

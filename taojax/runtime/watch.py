@@ -218,20 +218,18 @@ class Watch:
         # As many frames as a first block needs, so that its program is compiled too.
         for _ in range(LONGEST_COMPILED * (config.verdict.lag + 1)):
             self.answer(BLANK)
-            if self._n_final:
+            if self.finals():
                 break
         self._start()
         self.latencies_ms.clear()
 
     def _start(self) -> None:
-        self._state, self._n_frames, self._n_final = init(self._literal, self._tables), 0, 0
+        self._state, self._n_frames = init(self._literal, self._tables), 0
         self._follower = hindsight.Follower(self._config.verdict, self._tables)
         self._waiting: deque[tuple[float | None, str, str]] = deque()
 
-    def answer(self, line: bytes) -> list[dict[str, Any]]:
-        """Take in one line; say what it means, and what is final now of earlier ones.
-
-        A line that is no observation changes nothing.
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """Take in one line and say what it means; one that is no observation changes nothing.
 
         Raises:
             LineError: saying what is wrong with the line.
@@ -243,13 +241,16 @@ class Watch:
         clean = hindsight.clean(
             self._tables, seen.odometry[None], seen.rows[None], seen.similarity[None]
         )
-        now, finished = self._follower.push(jax.tree.map(lambda leaf: leaf[0], clean))
+        now = self._follower.push(jax.tree.map(lambda leaf: leaf[0], clean))
         said = self._said(seen.t_s, jax.device_get(record), now)
         self._n_frames += 1
-        lines = [said, *self._finals(finished)]
         said["latency_ms"] = round(1e3 * (time.perf_counter() - start), 3)
         self.latencies_ms.append(said["latency_ms"])
-        return lines
+        return said
+
+    def finals(self) -> list[dict[str, Any]]:
+        """Say what has become final since it was last asked."""
+        return self._finals(self._follower.finished())
 
     def flush(self) -> list[dict[str, Any]]:
         """Say what is final of the last frames, of which nothing more will be known."""
@@ -300,7 +301,6 @@ class Watch:
                     "probability_wrong": short(float(p[at])),
                     "reason": str(why[at]),
                 })  # fmt: skip
-            self._n_final += n
         return lines
 
     def run(self, stream: BinaryIO | BufferedIOBase, write: Callable[[str], object]) -> None:
@@ -316,10 +316,12 @@ class Watch:
             try:
                 if line is None:
                     raise LineError(f"is longer than {MOST_BYTES} bytes")
-                lines = self.answer(line)
+                said = self.answer(line)
             except LineError as error:
-                lines = [{"line": number, "error": str(error)}]
-            for said in lines:
+                said = {"line": number, "error": str(error)}
+            # At once: looking back takes ten times as long, and this frame need not wait for it.
+            write(json.dumps(said))
+            for said in self.finals():
                 write(json.dumps(said))
         for said in self.flush():
             write(json.dumps(said))
