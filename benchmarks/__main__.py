@@ -57,6 +57,9 @@ def _parser() -> argparse.ArgumentParser:
     speed.add_argument("--out", type=Path, help="folder to make (default runs/speed/TIME)")
     speed.add_argument("--gate", action="store_true", help="fail where a ratio got worse")
     speed.add_argument("--bless", action="store_true", help="make this run the baseline")
+    gpu = verbs.add_parser("accelerator", help="speed on a GPU, and how equal to the CPU")
+    gpu.add_argument("--quick", action="store_true", help="a small version")
+    gpu.add_argument("--out", type=Path, help="folder to make (default runs/accelerator/TIME)")
     reliability = verbs.add_parser("reliability", help="bad input, numbers, faults, long streams")
     reliability.add_argument("--quick", action="store_true", help="hundreds of cases")
     reliability.add_argument("--only", default="", help="of fuzz,numbers,faults,stream")
@@ -102,6 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Flags that a benchmark takes beside its folder, by their names.
     flags = {
         "ablation": ("data", "only"),
+        "accelerator": ("quick",),
         "gallery": (),
         "progress": ("data",),
         "promise": ("quick",),

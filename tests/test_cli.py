@@ -135,9 +135,12 @@ def test_a_calibration_file_carries_the_verdicts_to_run_time(data_folder, tmp_pa
     assert [float(r[3]) for r in decided] == pytest.approx([float(r[3]) for r in judged], abs=1e-6)
     assert [row[8] for row in decided] == [row[8] for row in judged]
     assert "next:   taojax closures" in capfd.readouterr().err
-    truth = str(data_folder / "truth")
+    truth = str(data_folder)
     assert main(["evaluate", str(scored), "--truth", truth, "--r-in", "3", "--r-out", "6"]) == 0
-    capfd.readouterr()
+    (tmp_path / "truth.tum").write_text("0 1 2 0 0 0 0 1\n")
+    assert main(["evaluate", str(scored), "--truth", str(tmp_path / "truth.tum")]) == 3
+    want = f"`taojax convert files {data_folder} --query-poses {tmp_path}/truth.tum`"
+    assert want in capfd.readouterr().err
     said = re.sub(r"<[^>]*>", "", (scored / "report.html").read_text())
     n_accepted = sum(row[1] == "accept" for row in decided)
     first = re.search(

@@ -87,10 +87,22 @@ def test_thermal_counts_are_stretched_and_equalised_as_the_guide_says(tmp_path):
     assert np.array_equal(eight_bit(tmp_path, image, Preparation()), want)
 
 
-def test_numbers_order_images_as_they_were_taken(tmp_path):
-    for name in ("9.png", "10.png", "100.png"):
-        (tmp_path / name).write_bytes(b"x")
-    assert [path.name for path in list_images(tmp_path)[0]] == ["9.png", "10.png", "100.png"]
+@pytest.mark.parametrize(("names", "order"), [
+    (["9", "10", "100"], "numbers"),
+    (["9.5", "10.25", "10.5"], "numbers"),
+    (["frame_9", "frame_10", "frame_100"], "names, numbers in them by size"),
+    (["a2/7", "a2/30", "a10/1"], "names, numbers in them by size"),
+    (["frame_0009", "frame_0010", "frame_0100"], "names"),
+    (["2024-01-05_08", "2024-01-05_10", "2024-02-01_09"], "names"),
+])  # fmt: skip
+def test_images_are_put_in_the_order_in_which_they_were_taken(names, order, tmp_path):
+    for name in names:
+        path = tmp_path / f"{name}.png"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"x")
+    paths, said = list_images(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in paths] == [f"{n}.png" for n in names]
+    assert said == order
 
 
 def test_an_interrupted_run_goes_on(tmp_path, monkeypatch, capsys):

@@ -102,7 +102,7 @@ def test_a_model_of_the_user_describes_and_all_that_was_made_is_said(street, tmp
         f"query descriptors: {tmp_path}/taojax-images/query-", "data folder: ", " (made)",
         "note: map: images are described by net.onnx",
         "note: query: images were taken when their names say",
-        "note: decided with the calibration that ships with taojax",
+        "note: decisions.csv is decided with the calibration that ships with taojax",
         "nothing is judged: no --truth; the calibration that ships with taojax decided",
         "next:   taojax closures",
     ):  # fmt: skip
@@ -223,6 +223,15 @@ def test_names_that_are_unix_times_are_read_as_such(name, seconds, tmp_path):
         (tmp_path / f"{first}{name[1:]}.png").write_bytes(b"x")
     t_s = images_of(tmp_path).t_s
     assert (t_s is None) if seconds is None else (t_s[0] == seconds)
+
+
+def test_images_without_times_go_with_rows_and_it_is_said(tmp_path):
+    images = images_of(photograph(tmp_path / "map", ["f_2", "f_9", "f_10"], [0, 20, 40], 1))
+    path = tum(tmp_path / "poses.tum", 1.6e9 + np.arange(3), loop(3))
+    session = map_session(images, path, PLAIN, Matching())
+    assert session.frames == ("f_2.png", "f_9.png", "f_10.png")
+    want = "the images of map go with the rows of poses.tum one by one, from f_2.png to f_10.png"
+    assert session.notes[-1] == want
 
 
 def test_images_without_times_are_as_many_as_poses(tmp_path):

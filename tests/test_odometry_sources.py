@@ -10,6 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from taojax.datasets.files import kind_of
 from taojax.datasets.odometry import odometry_at, simulated
 from taojax.datasets.odometry import read_odometry as read_drive
 from taojax.datasets.reading import Reading
@@ -394,6 +395,7 @@ def test_bags_of_both_versions_give_the_drive(tmp_path, kind, version):
     if version != "ros1":
         path = path.rename(tmp_path / "drive")
     check(read_odometry(path, "bag"))
+    assert kind_of(path) == "bag"
     inner = (
         tmp_path
         if version == "ros1"

@@ -587,3 +587,12 @@ def test_what_mapie_proves_is_promised_with_confidence(factor, rng, monkeypatch)
         assert is_promised or not does
     # An easy world is proved by both, a hopeless one by neither.
     assert (proved, promised) == {0.1: (20, 20), 2.0: (0, 0)}.get(factor, (proved, promised))
+
+
+def test_where_nothing_is_right_the_promise_asks_for_the_order_of_rows_and_offers_no_level():
+    risk_ = FINAL._replace(levels=np.array([0.1, np.nan, np.nan]), max_wrong=0.05)
+    wrong = np.ones(40, bool)
+    said = judge.promise_words(risk_, np.linspace(0, 1, 40), Own(~wrong, wrong))
+    assert said.startswith("nothing is accepted: in the calibration half (0 right and 40 wrong")
+    assert "do the rows of the descriptors follow" in said
+    assert "--max-wrong" not in said

@@ -103,7 +103,7 @@ def test_without_a_calibration_the_shipped_one_decides_and_the_seal_says_so(rng,
     run = scored(write_folder(tmp_path / "data", rng), tmp_path / "run")
     assert len(run.manifest["notes"]) == 1
     assert run.manifest["notes"][0].startswith(
-        "decided with the calibration that ships with taojax"
+        "decisions.csv is decided with the calibration that ships with taojax"
     )
     assert {"decisions.csv", "detector.toml", "delayed.csv"} <= set(run.manifest["sha256"])
     assert read_calibration(tmp_path / "run/detector.toml").final.levels.tolist() == (

@@ -55,18 +55,19 @@ _TINY = 1e-9  # below it a signal is constant and says nothing
 LEAST_PER_CLASS = 5
 """Frames of each class below which the model is called a fallback."""
 
-FALLBACK = "The probability is a fallback"
+FALLBACK = "The probability of being off the map is a fallback"
 """So begins the note of a detector that had too few frames to be fitted."""
 
 
 def _note(what: str, n_in: int, n_out: int) -> str:
     counts = f"{n_in} in-map and {n_out} map-out calibration frames"
     if min(n_in, n_out) >= LEAST_PER_CLASS:
-        return f"The probability is a logistic model over {what}, and fitted on {counts}."
+        return f"The probability of being off the map is a logistic model over {what}, and fitted on {counts}."
     return (
         f"{FALLBACK}, because there are only {counts} and two classes of at "
         f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the prior's, so "
-        "it ranks frames, but its level is not calibrated."
+        "it ranks frames, but its level is not calibrated; record a drive that leaves the map in "
+        "both halves."
     )
 
 

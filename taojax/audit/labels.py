@@ -139,7 +139,7 @@ def read_truth(path: Path, n_rows: int) -> Truth:
     """Read the true query poses and check that they belong to a run.
 
     Args:
-        path: the truth folder, or its `query_poses.csv`.
+        path: the truth folder, or its `query_poses.csv`, or the data folder around both.
         n_rows: frames of the run.
 
     Returns:
@@ -148,7 +148,8 @@ def read_truth(path: Path, n_rows: int) -> Truth:
     Raises:
         InputError: missing or malformed file, or another number of rows than the run has.
     """
-    file = path / "query_poses.csv" if path.is_dir() else path
+    within = path / "truth" if (path / "truth/query_poses.csv").is_file() else path
+    file = within / "query_poses.csv" if path.is_dir() else path
     table = read_table(file, "query_poses")
     n = len(table["t_s"])
     if n != n_rows:

@@ -172,6 +172,11 @@ def promise_words(refined: Risk, p: Float[np.ndarray, " n"], own: Own) -> str:
         )
         if n_right < LEAST_RIGHT:
             why = f"wrong answers look right and fewer than {LEAST_RIGHT} are right"
+        if not n_right:
+            return (
+                f"nothing is accepted: in {half} nothing is right; do the rows of the descriptors"
+                " follow those of the poses and of the odometry, and have both one clock?"
+            )
         return (
             f"nothing is accepted: in {half} {why}; {could}; better descriptors or a longer drive "
             "on the map would help"

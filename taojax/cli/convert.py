@@ -213,8 +213,8 @@ def motion_of(path: Path, flags: Formats) -> "Motion":
         refusal = UsageError if path.suffix.lower() == ".npy" else InputError
         raise refusal(
             f"{path} does not say what it holds; add --odometry-kind: steps (motion from"
-            " frame to frame), poses (where odometry believes to be), or the program that wrote it;"
-            " or --columns with the names of its columns"
+            " frame to frame), poses (where odometry believes to be), bag, or the program that"
+            " wrote it; or --columns with the names of its columns"
         )
     return Motion(path, kind, reading, flags.clock_offset)
 

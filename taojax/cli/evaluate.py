@@ -2,11 +2,13 @@
 
 import dataclasses
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import tyro
 
 from taojax.cli.common import Common, config_of, say
+from taojax.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Evaluate(Common):
     """Run folder made by `taojax score`."""
 
     truth: Annotated[Path, tyro.conf.arg(metavar="DIR")] = tyro.MISSING
-    """Folder that holds query_poses.csv."""
+    """Folder that holds query_poses.csv, or the data folder around it."""
 
 
 def run(args: Evaluate) -> None:
@@ -29,7 +31,13 @@ def run(args: Evaluate) -> None:
     from taojax.audit.summary_text import terminal_words
     from taojax.files.records import read_manifest
 
-    read_manifest(args.run)
+    dataset = read_manifest(args.run)["dataset"]
+    if args.truth.is_file() and args.truth.suffix != ".csv":
+        raise InputError(
+            f"{args.truth}: is no query_poses.csv; make one with `taojax convert files"
+            f" {quote(str(dataset))} --query-poses {quote(str(args.truth))}`, then give"
+            f" --truth {quote(str(Path(dataset) / 'truth'))}"
+        )
     config = config_of(args, args.run / "config.toml")
     evaluation = evaluate(args.run, args.truth, config, out=args.out)
     print("\n".join(terminal_words(evaluation)))

@@ -99,7 +99,13 @@ def make(flags: FromImages, folder: Path, *, progress: bool) -> Made:
             raise InputError(f"{path}: no such file or folder ({_flag(name)}); name another one")
     from taojax.datasets.convert import Choices, make_folder
     from taojax.datasets.edit import truth_text
-    from taojax.datasets.from_images import images_of, key_of, map_session, query_session
+    from taojax.datasets.from_images import (
+        images_of,
+        key_of,
+        map_session,
+        query_session,
+        row_by_row,
+    )
     from taojax.datasets.sessions import Matching
 
     map_images, query_images, map_poses, odometry = (getattr(flags, name) for name in NEEDED)
@@ -109,7 +115,9 @@ def make(flags: FromImages, folder: Path, *, progress: bool) -> Made:
     mapped = map_session(sides[0], map_poses, reading, Matching(flags.gate_s))
     query = query_session(sides[1], motion)
     by = "GIST" if flags.model is None else flags.model.name
-    mapped = dataclasses.replace(mapped, notes=(*mapped.notes, f"images are described by {by}"))
+    more = (f"images are described by {by}",)
+    more += () if query is not None else (row_by_row(sides[1], odometry),)
+    mapped = dataclasses.replace(mapped, notes=(*mapped.notes, *more))
 
     views = tuple(
         _described(side, images.folder, folder, flags, progress=progress)

@@ -4,8 +4,10 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ __all__ = [
     "gist",
     "kind_of_image",
     "list_images",
+    "natural",
     "read_image",
 ]
 
@@ -50,6 +53,15 @@ class Preparation:
     """Tiles across and down."""
 
 
+_NUMBER = re.compile(r"[0-9]+([.][0-9]+)?").fullmatch
+
+
+def natural(text: str) -> list[tuple[int, int, str]]:
+    """Return a key that sorts 9 before 10."""
+    words = "".join(c if c.isdecimal() else " " + c + " " for c in text).split()
+    return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words]
+
+
 def list_images(folder: Path) -> tuple[list[Path], str]:
     """List the images below a folder in the order in which they were taken.
 
@@ -57,7 +69,7 @@ def list_images(folder: Path) -> tuple[list[Path], str]:
         folder: hidden files and other endings are passed over.
 
     Returns:
-        Paths, and what orders them: names, or the numbers that they are.
+        Paths, and what orders them: names, the numbers in them, or the numbers that they are.
 
     Raises:
         InputError: no folder, or fewer than three images.
@@ -70,11 +82,13 @@ def list_images(folder: Path) -> tuple[list[Path], str]:
     ]  # fmt: skip
     if len(found) < 3:
         raise fail(folder, f"holds {len(found)} images", f"at least 3 of {', '.join(ENDINGS)}")
-    names = {path: path.relative_to(folder).as_posix() for path in found}
-    is_number = all(path.stem.isascii() and path.stem.isdigit() for path in found)
-    if is_number and len({path.parent for path in found}) == 1:
-        return sorted(found, key=lambda path: (int(path.stem), path.name)), "numbers"
-    return sorted(found, key=names.__getitem__), "names"
+    name_of = lambda path: path.relative_to(folder).as_posix()
+    if len({path.parent for path in found}) == 1 and all(_NUMBER(path.stem) for path in found):
+        return sorted(found, key=lambda path: (Decimal(path.stem), path.name)), "numbers"
+    # Nobody means frame_10 to come before frame_9.
+    counted = sorted(found, key=lambda path: (natural(name_of(path)), path.name))
+    is_text = counted == sorted(found, key=name_of)
+    return counted, "names" if is_text else "names, numbers in them by size"
 
 
 def read_image(path: Path) -> Shaped[np.ndarray, "h w *c"]:

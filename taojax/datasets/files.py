@@ -51,7 +51,8 @@ def kind_of(path: Path, reading: Reading = PLAIN) -> OdometryKind | None:
         InputError: no such file, empty, or not text.
     """
     if path.is_dir():
-        return None
+        is_bag = (path / "metadata.yaml").is_file() or any(path.glob("*.bag"))
+        return "bag" if is_bag else None
     check_begin(path)
     by_ending: dict[str, OdometryKind | None] = {
         ".npy": None, ".bag": "bag", ".mcap": "bag", ".db3": "bag", ".g2o": "g2o",

@@ -3,6 +3,7 @@
 Images named by UNIX time are matched by it; others are as many as rows and follow their order.
 """
 
+import dataclasses
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,7 +24,7 @@ from taojax.datasets.trajectory import Trajectory, pose_at
 from taojax.files.records import code_digest
 from taojax.files.specs import fail
 
-__all__ = ["Images", "images_of", "key_of", "map_session", "query_session"]
+__all__ = ["Images", "images_of", "key_of", "map_session", "query_session", "row_by_row"]
 
 UNIT_OF = {10: "s", 13: "ms", 16: "us", 19: "ns"}
 """Unit of a UNIX time of so many digits, from 2001 to 2286."""
@@ -92,7 +93,16 @@ def map_session(images: Images, poses: Path, reading: Reading, matching: Matchin
             frames, notes = (images.names, images.t_s), (*drive.notes, TIMED)
             return matched_session(images.folder, frames, drive.poses, matching, notes)
     _check_row_by_row(drive, images, poses)
-    return session_of(drive, images.names)
+    own = session_of(drive, images.names)
+    return dataclasses.replace(own, notes=(*own.notes, row_by_row(images, poses)))
+
+
+def row_by_row(images: Images, path: Path) -> str:
+    """Say which image was taken to go with which row."""
+    return (
+        f"the images of {images.folder.name} go with the rows of {path.name} one by one, from"
+        f" {images.names[0]} to {images.names[-1]}"
+    )
 
 
 def query_session(images: Images, motion: Motion) -> Session | None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from taojax.datasets.describe import natural
 from taojax.datasets.files import DERIVED, NUMBERED, read_poses
 from taojax.datasets.folder import Session
 from taojax.datasets.reading import PLAIN, Drive, Reading
@@ -242,7 +243,7 @@ def _session_of_names(path: Path, names: Sequence[str], fields: Sequence[list[st
     xy = np.array([[float(parts[1]), float(parts[2])] for parts in fields])
     order, said = np.arange(len(xy)), "images are taken in the order of their names"
     if not _is_drive(xy):
-        keys = [(_part(parts, TIME), _natural(_part(parts, ID))) for parts in fields]
+        keys = [(_part(parts, TIME), natural(_part(parts, ID))) for parts in fields]
         order = np.array(sorted(range(len(xy)), key=keys.__getitem__))
         said = "images are put in the order of the times and numbers in their names"
     if not _is_drive(xy[order]):
@@ -255,12 +256,6 @@ def _session_of_names(path: Path, names: Sequence[str], fields: Sequence[list[st
 
 def _part(parts: Sequence[str], at: int) -> str:
     return parts[at] if at < len(parts) else ""
-
-
-def _natural(text: str) -> list[tuple[int, int, str]]:
-    """Return a key that sorts 9 before 10."""
-    words = "".join(c if c.isdecimal() else " " + c + " " for c in text).split()
-    return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words]
 
 
 def _is_drive(xy: Float[np.ndarray, "n 2"]) -> bool:

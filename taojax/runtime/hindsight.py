@@ -558,8 +558,8 @@ def cut(  # noqa: PLR0913 - a log and where to cut it
     return Block(frames, taken(answers, 0), is_there, kept), side
 
 
-CHUNK = 250
-"""Frames per compiled scan, about."""
+CHUNK = 80
+"""Frames per compiled scan, about: logs of every length share it, and trials of 160 fill it."""
 
 
 def as_first_look(numbers: Detector) -> FirstLook:
@@ -648,7 +648,7 @@ def replay_both(
         Answers as NumPy arrays.
     """
     n, total = block_frames(config), len(seen.odometry)
-    width = n * min(max(1, CHUNK // n), -(-total // n))
+    width = n * max(1, CHUNK // n)
     far = reach(config, tables.places, seen.odometry)
     # The beliefs of a block wait until its lag has passed, and no longer: a long log on a large map
     # would fill the memory.

@@ -178,13 +178,12 @@ def replay_log(
         for start in range(0, n_frames, CHUNK_FRAMES):
             n = min(CHUNK_FRAMES, n_frames - start)
             # The last chunk is padded with frames that never were; their records are dropped.
-            width = min(CHUNK_FRAMES, max(n, n_frames))
             chunk = jax.tree.map(
-                lambda leaf, a=start, b=start + n, w=width: jnp.asarray(
-                    np.concatenate([leaf[a:b], np.repeat(leaf[b - 1 : b], w - (b - a), axis=0)])
-                ),
+                lambda leaf, a=start, b=start + n: jnp.asarray(np.concatenate(
+                    [leaf[a:b], np.repeat(leaf[b - 1 : b], CHUNK_FRAMES - (b - a), axis=0)]
+                )),
                 frames,
-            )
+            )  # fmt: skip
             state, records = replay(settings, tables, chunk, state)
             parts.append(jax.tree.map(lambda leaf, m=n: np.asarray(leaf)[:m], records))
             bar.set_description_str("scoring", refresh=False)
@@ -384,7 +383,9 @@ def _sealed(
     if foreign := foreign_map(used.fitted_on, map_of(known_map)):
         notes.append(foreign)
     if used.fitted_on is None:
-        notes.append(f"decided with {SHIPPED}: no frame of this place has set its level")
+        notes.append(
+            f"decisions.csv is decided with {SHIPPED}: no frame of this place has set its level"
+        )
     return write_run(
         out,
         signals=table,
