@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from taojax.runtime.retrieval import retrieve
     from taojax.runtime.score import verdicts
     from taojax.runtime.stream import StreamState, init, replay, step
+    from taojax.runtime.watch import Watch
 
 _HOMES = {
     "taojax.config": ("AuditConfig", "Config", "StreamConfig", "VerdictConfig"),
@@ -37,6 +38,7 @@ _HOMES = {
     "taojax.runtime.retrieval": ("retrieve",),
     "taojax.runtime.score": ("verdicts",),
     "taojax.runtime.stream": ("StreamState", "init", "replay", "step"),
+    "taojax.runtime.watch": ("Watch",),
 }  # fmt: skip
 
 __all__ = [
@@ -58,6 +60,7 @@ __all__ = [
     "StreamState",
     "TaojaxError",
     "VerdictConfig",
+    "Watch",
     "__version__",
     "branch_cost",
     "init",
@@ -78,3 +81,7 @@ def __getattr__(name: str) -> Any:
         if name in names:
             return getattr(importlib.import_module(home), name)
     raise AttributeError(f"module 'taojax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

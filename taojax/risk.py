@@ -196,7 +196,13 @@ def for_run(calibration: Calibration, max_wrong: float, lag: int) -> Calibration
         calibration: frozen numbers.
         max_wrong: share of the accepted answers that may be wrong.
         lag: of the run; with 0 the final answers are the causal ones, and judged as such.
+
+    Raises:
+        InputError: something else than a calibration.
     """
+    if not isinstance(calibration, Calibration):
+        got = type(calibration).__name__
+        raise InputError(f"calibration: expected what read_calibration returns, got {got}")
     now, final = at_most(calibration.now, max_wrong), at_most(calibration.final, max_wrong)
     if lag == 0:
         final = now._replace(columns=tuple(name.removeprefix("now_") for name in now.columns))
@@ -335,13 +341,16 @@ def _parse(text: str, where: str) -> Calibration:
     return Calibration(now, final, map_out, facts)
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path | str) -> Calibration:
     """Read a calibration file.
+
+    Args:
+        path: calibration.toml of an audited run, or detector.toml of a scored one.
 
     Raises:
         InputError: unreadable, made by taojax 0.1.0, or its numbers do not fit together.
     """
-    return _parse(read_text(path), str(path))
+    return _parse(read_text(Path(path)), str(path))
 
 
 @lru_cache(maxsize=1)

@@ -1,14 +1,12 @@
 """README, guide and numbers: their code runs as printed, their links and commands exist."""
 
-import dataclasses
 import re
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import loop, motions
+from conftest import loop, motions, write_folder
 from jaxtyping import Array, Float
 
 import taojax
@@ -62,6 +60,8 @@ def test_the_robot_program_runs_as_printed(rng):
         "similarity": jnp.linspace(0.9, 0.1, 20),
     }
     exec(BLOCKS[1], names)
+    assert names["now"]["verdict"] == "abstain"
+    assert names["closures"] == []
     assert taojax.STATUSES[int(names["record"].status)] == "warming_up"
 
 
@@ -70,11 +70,10 @@ def test_the_library_is_used_as_printed(rng):
     away = np.linalg.norm(queries[:, None, :2] - places[None, :, :2], axis=2)
     like = np.exp(-away / 6.0)
     names = {
-        "taojax": taojax, "jnp": jnp, "jax": jax, "dataclasses": dataclasses,
         "map_poses": places, "map_descriptors": np.eye(60, dtype=np.float32) + 0.01,
         "query_descriptors": like.astype(np.float32), "odometry": motions(queries),
     }  # fmt: skip
-    exec(block("found = taojax.retrieve"), names)
+    exec(block("import dataclasses"), names)
     assert names["may_enter"].shape == (24,)
     assert set(names["closures"]) == set(column_names("verdicts"))
     p = jnp.asarray(queries[:20, :2], jnp.float32)
@@ -86,6 +85,17 @@ def test_the_library_is_used_as_printed(rng):
     assert names["pull"].shape == (20, 2)
     assert np.isfinite(names["pull"]).all()
     assert names["best"].cost <= names["best"].start_cost
+
+
+def test_watch_is_listened_to_as_printed(rng, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_folder(tmp_path / "my_data", rng)
+    line = {"odometry": [1.0, 0.0, 0.0], "index": [3, 4], "similarity": [0.9, 0.8]}
+    names = {"frames": [line] * 30}
+    exec(block("import json, subprocess"), names)
+    assert names["watch"].wait() == 0
+    assert not names["reader"].is_alive()
+    assert {row[0] for row in names["closures"]} <= set(range(30))
 
 
 def test_every_name_of_the_face_has_a_docstring_and_every_function_is_in_the_guide():

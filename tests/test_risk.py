@@ -1,6 +1,8 @@
 """Right or wrong: frozen numbers in a file, levels that fail closed, and the judge's own labels."""
 
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -587,6 +589,14 @@ def test_what_mapie_proves_is_promised_with_confidence(factor, rng, monkeypatch)
         assert is_promised or not does
     # An easy world is proved by both, a hopeless one by neither.
     assert (proved, promised) == {0.1: (20, 20), 2.0: (0, 0)}.get(factor, (proved, promised))
+
+
+def test_the_name_of_a_calibration_is_none():
+    # In an interpreter of its own: here every argument's type is checked at the call.
+    code = "import taojax.risk as risk; risk.for_run('calibration.toml', 0.05, 20)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    said = "InputError: calibration: expected what read_calibration returns, got str"
+    assert done.stderr.splitlines()[-1].endswith(said)
 
 
 def test_where_nothing_is_right_the_promise_asks_for_the_order_of_rows_and_offers_no_level():

@@ -121,7 +121,10 @@ def test_a_frame_that_weighs_nothing_is_out_of_eq_1():
 
 WRONG = {
     "odometry": (jnp.zeros(4), "frame.odometry: expected floats of shape (3), got float32 (4,)"),
-    "index": (jnp.zeros(7), "frame.index: expected whole numbers of shape (C), got float32 (7,)"),
+    "index": (
+        jnp.zeros(7),
+        "frame.index: expected whole numbers of shape (C), got float32 (7,) beside similarity (7,)",
+    ),
     "similarity": (jnp.zeros((2, 7)), "frame.similarity: expected floats of shape (C)"),
     "weight": (jnp.ones(3), "frame.weight: expected floats of shape (), got float32 (3,)"),
 }

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import write_folder
@@ -20,6 +21,7 @@ from taojax.errors import InputError
 from taojax.files import records
 from taojax.files.tables import read_table
 from taojax.risk import to_toml as calibration_toml
+from taojax.runtime.frames import Frame
 from taojax.runtime.score import score
 from taojax.runtime.watch import MOST_BYTES, LineError, Watch, load_map, parse
 
@@ -127,6 +129,28 @@ def test_a_final_line_comes_a_lag_later_and_the_last_ones_with_the_end(folder, t
     assert {row["kind"] for row in rest} == {"final"}
     assert len(rest) <= 5
     assert watcher.flush() == []
+
+
+def test_a_program_gets_from_frames_what_a_pipe_gets_from_lines(folder, tables):
+    lines = (folder / "feed.jsonl").read_bytes().splitlines()
+    piped, own = (Watch(CONFIG, tables, CALIBRATION) for _ in range(2))
+    seen = [json.loads(line) for line in lines]
+    names = ("odometry", "index", "similarity")
+    kinds = (jnp.float32, jnp.int32, jnp.float32)
+    frames = [
+        Frame(*(jnp.asarray(one[name], kind) for name, kind in zip(names, kinds, strict=True)))
+        for one in seen
+    ]
+    assert same_but_for_time(
+        [own.step(frame, one.get("t_s")) for frame, one in zip(frames, seen, strict=True)],
+        [piped.answer(line) for line in lines],
+    )
+    finals = own.finals()
+    assert finals == piped.finals()
+    assert [row["frame"] for row in finals] == list(range(len(finals)))
+    assert own.flush() == piped.flush()
+    with pytest.raises(InputError, match=r"frame: index\[0\] is 5000, but the map has rows 0 to"):
+        own.step(Frame(frames[0].odometry, frames[0].index + 5000, frames[0].similarity))
 
 
 def test_an_acceptance_that_is_not_kept_is_withdrawn(folder, tables):

@@ -62,7 +62,10 @@ FALLBACK = "The probability of being off the map is a fallback"
 def _note(what: str, n_in: int, n_out: int) -> str:
     counts = f"{n_in} in-map and {n_out} map-out calibration frames"
     if min(n_in, n_out) >= LEAST_PER_CLASS:
-        return f"The probability of being off the map is a logistic model over {what}, and fitted on {counts}."
+        return (
+            f"The probability of being off the map is a logistic model over {what}, and fitted on "
+            f"{counts}."
+        )
     return (
         f"{FALLBACK}, because there are only {counts} and two classes of at "
         f"least {LEAST_PER_CLASS} are needed to calibrate: its weights are the prior's, so "

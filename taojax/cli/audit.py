@@ -92,6 +92,12 @@ def run(args: Audit) -> None:
 
 def _check(args: Audit) -> None:
     """Refuse flags that contradict each other."""
+    truth = args.from_images.truth
+    if args.dataset is not None and truth is not None and args.from_images.map_images is None:
+        raise UsageError(
+            f"--truth goes with --map-images; `taojax convert files {args.dataset} --query-poses"
+            f" {truth}` adds it to a data folder"
+        )
     if are_asked(args.from_images) and (
         args.dataset is not None or args.scenario or args.simulate_descriptors or args.self
     ):

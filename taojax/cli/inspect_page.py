@@ -161,7 +161,8 @@ def files(page: Page, found: "Found", *, has_truth: bool) -> None:
         state = "BAD" if name in found.problems else "ok"
         page.say(name, f"{state:<5}{found.files.get(name, '')}")
     if not has_truth:
-        page.say("truth/query_poses.csv", "none: can be scored, not audited")
+        page.say("truth/query_poses.csv", "none: can be scored, not audited; added by `taojax"
+                 " convert files THIS_FOLDER --query-poses FILE`")  # fmt: skip
     for note in found.observations.notes if found.observations else ():
         page.say("note", note)
     page.head("problems")

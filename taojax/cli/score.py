@@ -65,12 +65,14 @@ def run(args: Score) -> None:
 
 
 def decided(out: Path) -> str:
-    """Say what was decided and what can be done with it."""
+    """Say what was decided, what is promised and what can be done with it."""
     from taojax.files.tables import read_table
+    from taojax.risk import read_calibration
 
+    promise = read_calibration(out / "detector.toml").final.promise
     verdict = read_table(out / "decisions.csv", "verdicts")["verdict"]
     n = {name: int((verdict == name).sum()) for name in ("accept", "reject", "abstain")}
     return (
         f"decided {n['accept']} accepted, {n['reject']} rejected, {n['abstain']} left open"
-        f" (decisions.csv)\nnext:   taojax closures {out}"
+        f" (decisions.csv)\npromised: {promise}\nnext:   taojax closures {out}"
     )

@@ -17,7 +17,8 @@ class Watch(Compiling):
     """Judge a live stream: one JSON line per frame on stdin, verdict lines on stdout.
 
     In: {"t_s": 0.1, "odometry": [dx_m, dy_m, dtheta_rad], "index": [...], "similarity": [...]}.
-    Out: a line of kind "now" at once, and one of kind "final" a lag later, which says when an
+    Out: a line of kind "now" at once, and one of kind "final" a lag later, ten at a time: match
+    them by "frame", never count lines. A final line says when an
     earlier acceptance is withdrawn. A line that is not understood is answered by
     {"line": n, "error": "..."} and changes nothing.
 
@@ -46,7 +47,7 @@ def run(args: Watch) -> None:
     """Watch until stdin ends."""
     from taojax import config as settings
     from taojax.errors import ConfigError, UsageError
-    from taojax.risk import SHIPPED, for_run, foreign_map, read_calibration, shipped
+    from taojax.risk import SHIPPED, foreign_map, read_calibration, shipped
     from taojax.runtime.watch import Watch as Watcher
     from taojax.runtime.watch import load_map
 
@@ -56,15 +57,14 @@ def run(args: Watch) -> None:
     except ConfigError as error:
         raise UsageError(f"flag {error}") from error
     own = None if args.calibration is None else read_calibration(args.calibration)
-    used = for_run(own or shipped(), config.audit.max_wrong, config.verdict.lag)
     loaded = load_map(args.folder, config.stream)
-    if said := foreign_map(used.fitted_on, loaded.facts):
+    if said := foreign_map((own or shipped()).fitted_on, loaded.facts):
         say(f"careful: {said}")
     if own is None:
         say(f"note: decided with {SHIPPED}: no frame of this place has set its level")
     say("compiling for some 20 s; where an earlier command has compiled it, less")
     start = time.perf_counter()
-    watcher = Watcher(config, loaded.tables, used)
+    watcher = Watcher(config, loaded.tables, own)
     say(f"ready: map of {len(loaded.tables.places.grid.xy)} places, {loaded.scale}; "
         f"compiled in {time.perf_counter() - start:.1f} s")  # fmt: skip
     try:

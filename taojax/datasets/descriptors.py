@@ -140,7 +140,8 @@ def _by_order(
 ) -> Int[np.ndarray, " k"]:
     """Return the file's rows of the frames that stay, where rows are frames in name order."""
     if n_rows not in (len(frames), len(kept)):
-        what = f"{n_rows} rows, but the session has {len(frames)} frames, of which {len(kept)} stay"
+        some = "" if len(kept) == len(frames) else f", of which {len(kept)} stay"
+        what = f"{n_rows} rows, but the poses or odometry beside it have {len(frames)} frames{some}"
         fix = "store one row per frame, or their names (npz with descs and paths, or h5)"
         raise fail(path, what, fix)
     chosen = np.arange(n_rows) if n_rows == len(frames) else kept

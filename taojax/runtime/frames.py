@@ -20,7 +20,7 @@ class Frame(eqx.Module):
     """Motion from the frame before, in its body axes: forward [m], left [m], yaw [rad]."""
 
     index: Int[Array, "*t c"]
-    """Retrieved map rows, best first, -1 = no candidate."""
+    """Retrieved map rows, best first, -1 = no candidate. Rows that the map lacks are none."""
 
     similarity: Float[Array, "*t c"]
     """Their similarities, at most 1."""
@@ -56,7 +56,10 @@ def check_frame(frame: Frame, axes: int = 0) -> None:
         is_right = hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, kind)
         if not is_right or leaf.shape != (*start, *shape) or len(start) != axes:
             what = "whole numbers" if kind is jnp.integer else "floats"
-            raise InputError(f"frame.{name}: expected {what} of shape {words}, got {got}")
+            said = f"frame.{name}: expected {what} of shape {words}, got {got}"
+            others = ("odometry",) * axes + ("similarity",) * (name == "index")
+            beside = [f"{o} {getattr(getattr(frame, o), 'shape', ())}" for o in others if o != name]
+            raise InputError(said + (f" beside {' and '.join(beside)}" if beside else ""))
 
 
 class Signals(eqx.Module, Mapping[str, Array]):

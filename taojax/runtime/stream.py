@@ -183,6 +183,9 @@ def rank_costs(
 
 
 def _whole(config: Config | StreamConfig) -> Config:
+    if not isinstance(config, Config | StreamConfig):
+        got = type(config).__name__
+        raise InputError(f"config: expected Config or StreamConfig, got {got}")
     return config if isinstance(config, Config) else Config(stream=config)
 
 

@@ -24,9 +24,9 @@ from taojax.files.dataset_info import DESCRIPTORS
 from taojax.files.records import digest_file
 from taojax.files.specs import read_npy
 from taojax.files.tables import POSE, read_table, stacked
-from taojax.risk import Calibration, MapFacts, shipped
+from taojax.risk import Calibration, MapFacts, for_run, shipped
 from taojax.runtime import hindsight
-from taojax.runtime.frames import STATUSES, Frame, StreamRecord
+from taojax.runtime.frames import STATUSES, Frame, StreamRecord, check_frame
 from taojax.runtime.maps import MapTables, map_tables
 from taojax.runtime.observations import descriptor_names
 from taojax.runtime.retrieval import N_KEPT
@@ -174,6 +174,13 @@ def parse(line: bytes, n_map: int) -> Observed:
         raise
     except (ValueError, OverflowError, RecursionError) as error:
         raise LineError(f"is not JSON ({str(error).splitlines()[0][:80]})") from error
+    return _observed(t_s, odometry, index, similarity)
+
+
+def _observed(
+    t_s: float | None, odometry: list[Any], index: list[Any], similarity: list[Any]
+) -> Observed:
+    """Return a frame whose list is as long as every other's, so that nothing is compiled anew."""
     rows, values = np.full(N_KEPT, -1, np.int32), np.zeros(N_KEPT, np.float32)
     kept = min(len(index), N_KEPT)
     rows[:kept], values[:kept] = index[:kept], similarity[:kept]
@@ -193,9 +200,10 @@ def lines_of(stream: BinaryIO | BufferedIOBase) -> Iterator[bytes | None]:
 
 
 class Watch:
-    """A map, a state and what was seen so far; the first step is compiled when it is made.
+    """Two verdicts on every frame of a stream: at once, and again a lag later.
 
-    The one place with a state that changes: a process that watches is one.
+    A map, a state and what was seen so far; the first step is compiled when it is made. The one
+    place with a state that changes: a process that watches is one.
     """
 
     def __init__(
@@ -204,14 +212,16 @@ class Watch:
         """Compile the step.
 
         Args:
-            config: settings; those of the judge are not used.
-            tables: from `load_map`.
-            calibration: frozen numbers; the shipped ones when omitted.
+            config: settings; of the judge's only the share of accepted answers that may be wrong.
+            tables: from `map_tables`.
+            calibration: frozen numbers, from `read_calibration`; the shipped ones when omitted.
         """
         # The map stays an argument: folded into the program it compiles for longer, and rounds
         # differently from `taojax score`.
         self._config, self._tables, self._literal = config, tables, literal(config)
-        self._calibration = calibration or shipped()
+        self._calibration = for_run(
+            calibration or shipped(), config.audit.max_wrong, config.verdict.lag
+        )
         self._n_map = tables.places.grid.xy.shape[0]
         self.latencies_ms: deque[float] = deque(maxlen=REMEMBERED)
         self._start()
@@ -235,7 +245,34 @@ class Watch:
             LineError: saying what is wrong with the line.
         """
         start = time.perf_counter()
-        seen = parse(line, self._n_map)
+        return self._seen(parse(line, self._n_map), start)
+
+    def step(self, frame: Frame, t_s: float | None = None) -> dict[str, Any]:
+        """Take in one frame of a program's own and say what it means.
+
+        Args:
+            frame: one observation, NumPy or JAX; lists of any length, best first. Its weight counts
+                for nothing here.
+            t_s: its stamp, which is handed back.
+
+        Returns:
+            The entries of a line of kind now, see data_specs/watch.toml.
+
+        Raises:
+            InputError: arrays of a wrong shape or type, rows outside the map, or a list that is not
+                best first.
+        """
+        start = time.perf_counter()
+        check_frame(frame)
+        leaves = frame.odometry, frame.index, frame.similarity
+        odometry, index, similarity = (np.asarray(leaf).tolist() for leaf in leaves)
+        try:
+            _check_list(index, similarity, self._n_map)
+        except LineError as error:
+            raise InputError(f"frame: {error}") from error
+        return self._seen(_observed(t_s, odometry, index, similarity), start)
+
+    def _seen(self, seen: Observed, start: float) -> dict[str, Any]:
         frame = Frame(*(jnp.asarray(leaf) for leaf in seen[1:]))
         self._state, record = step(self._literal, self._tables, self._state, frame)
         clean = hindsight.clean(
@@ -249,7 +286,10 @@ class Watch:
         return said
 
     def finals(self) -> list[dict[str, Any]]:
-        """Say what has become final since it was last asked."""
+        """Say what has become final since it was last asked: blocks of half a lag, oldest first.
+
+        To be asked after every frame, or now and then; what waits is kept.
+        """
         return self._finals(self._follower.finished())
 
     def flush(self) -> list[dict[str, Any]]:
