@@ -6,7 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import loop, motions, write_folder
+from conftest import loop, motions
 from jaxtyping import Array, Float
 
 import taojax
@@ -85,17 +85,6 @@ def test_the_library_is_used_as_printed(rng):
     assert names["pull"].shape == (20, 2)
     assert np.isfinite(names["pull"]).all()
     assert names["best"].cost <= names["best"].start_cost
-
-
-def test_watch_is_listened_to_as_printed(rng, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_folder(tmp_path / "my_data", rng)
-    line = {"odometry": [1.0, 0.0, 0.0], "index": [3, 4], "similarity": [0.9, 0.8]}
-    names = {"frames": [line] * 30}
-    exec(block("import json, subprocess"), names)
-    assert names["watch"].wait() == 0
-    assert not names["reader"].is_alive()
-    assert {row[0] for row in names["closures"]} <= set(range(30))
 
 
 def test_every_name_of_the_face_has_a_docstring_and_every_function_is_in_the_guide():

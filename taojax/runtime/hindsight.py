@@ -409,6 +409,7 @@ def finish(config: VerdictConfig, tables: MapTables, block: Block, n_past: int) 
     return jax.lax.map(lambda x: answered(*x), (jnp.arange(n), kept.belief, backward, kept.since))
 
 
+@jax.jit
 def cleaned(
     tables: MapTables,
     odometry: Float[Array, "*t 3"],
@@ -568,6 +569,21 @@ def as_first_look(numbers: Detector) -> FirstLook:
     return FirstLook(*(jnp.asarray(part, jnp.float32) for part in parts))
 
 
+@jax.jit
+def ask(
+    config: VerdictConfig,
+    first: FirstLook,
+    history: History,
+    gap_m: Float[Array, ""],
+    odometry: Float[Array, "3"],
+    answer: Answer,
+) -> tuple[History, Answer]:
+    """Say of one answer how far those before it contradict it; see `recalled`."""
+    trust = first_trust(first, answer.features[:-1])
+    history, against = contradiction(config, gap_m, history, odometry, answer.pose, trust)
+    return history, eqx.tree_at(lambda a: a.features, answer, answer.features.at[-1].set(against))
+
+
 @eqx.filter_jit
 def recalled(
     config: VerdictConfig,
@@ -587,16 +603,8 @@ def recalled(
         odometry: into each frame.
         answers: causal or final ones, in order.
     """
-
-    def ask(history: History, frame: tuple[Array, ...]) -> tuple[History, Array]:
-        gap, motion, pose, features = frame
-        trust = first_trust(first, features[:-1])
-        history, against = contradiction(config, gap, history, motion, pose, trust)
-        return history, features.at[-1].set(against)
-
-    every = gap_m, odometry, answers.pose, answers.features
-    history, features = jax.lax.scan(ask, history, every)
-    return history, eqx.tree_at(lambda a: a.features, answers, features)
+    each = lambda history, frame: ask(config, first, history, *frame)
+    return jax.lax.scan(each, history, (gap_m, odometry, answers))
 
 
 def recall_log(
@@ -752,11 +760,11 @@ class Follower:
         self._first_look = {k: as_first_look(v) for k, v in first_look()._asdict().items()}
         self._histories = dict.fromkeys(self._first_look, no_history())
 
-    def _asked(self, kind: str, odometry: np.ndarray, answers: Answer) -> Answer:
-        """Hold answers against those before them, in order."""
+    def _asked(self, odometry: np.ndarray, answers: Answer) -> Answer:
+        """Hold final answers against those before them, in order."""
         gap_m = jnp.broadcast_to(self._tables.places.gap_m, (len(odometry),))
-        self._histories[kind], answers = recalled(
-            self._config, self._first_look[kind], self._histories[kind],
+        self._histories["final"], answers = recalled(
+            self._config, self._first_look["final"], self._histories["final"],
             gap_m, jnp.asarray(odometry), jax.tree.map(jnp.asarray, answers),
         )  # fmt: skip
         return jax.tree.map(np.asarray, answers)
@@ -769,10 +777,11 @@ class Follower:
         """
         before = self.state.pending
         self.state, answer = advance(self._config, self._tables, self.state, seen)
-        one = self._asked(
-            "now", np.asarray(seen.odometry)[None], jax.tree.map(lambda leaf: leaf[None], answer)
-        )
-        answer = jax.tree.map(lambda leaf: leaf[0], one)
+        self._histories["now"], answer = ask(
+            self._config, self._first_look["now"], self._histories["now"],
+            self._tables.places.gap_m, seen.odometry, answer,
+        )  # fmt: skip
+        answer = jax.device_get(answer)
         self._seen.append(seen)
         self._now.append(answer)
         self._kept.append(Kept(self.state.belief, before, self.state.pending))
@@ -812,7 +821,7 @@ class Follower:
             take = lambda answer, rows: jax.tree.map(lambda leaf: leaf[rows], answer)
             final = take(final, of_final)
             if config.lag:
-                final = self._asked("final", odometry[rows], final)
+                final = self._asked(odometry[rows], final)
             done.append(Finished(self._due, take(now, rows), final))
             self._due += n
             del self._kept[:n]
