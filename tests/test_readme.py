@@ -76,6 +76,10 @@ def test_the_library_is_used_as_printed(rng):
     exec(block("import dataclasses"), names)
     assert names["may_enter"].shape == (24,)
     assert set(names["closures"]) == set(column_names("verdicts"))
+    frames = names["frames"]
+    stale = taojax.Frame(frames.odometry, frames.index.at[3, 2].set(60), frames.similarity)
+    with pytest.raises(taojax.InputError, match="frame 3, rank 2 is 60, but the map has rows 0 to"):
+        taojax.verdicts(names["config"], names["tables"], stale)
     p = jnp.asarray(queries[:20, :2], jnp.float32)
     names |= {"p": p, "q": p + 0.1, "params": taojax.CostParams(0.1, 100.0, 1e3, 3.0, 9.0)}
     names |= {"similarity": jnp.ones(20), "has_anchor": jnp.ones(20, bool)}

@@ -198,7 +198,8 @@ def promise_words(refined: Risk, p: Float[np.ndarray, " n"], own: Own) -> str:
         )
     need = int(np.ceil(np.log(1.0 - CONFIDENCE) / np.log1p(-most)) * CORRELATED_FRAMES)
     return (
-        f"at most {most:.0%} of the accepted answers wrong as measured and not proven: {said}; "
+        f"at most {most:.0%} of the accepted answers wrong as measured on {n} and not proven: "
+        f"{said}; "
         f"{need} accepted answers without a wrong one would prove it with {CONFIDENCE:.0%} "
         "confidence"
     )

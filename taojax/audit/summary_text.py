@@ -376,7 +376,7 @@ def _decided(judgement: Judgement) -> list[str]:
     rejected = np.isin(decided, ("rejected_in", "rejected_out"))
     return [
         f"Decided at run time, with numbers frozen before (decisions.csv): of all "
-        f"{len(decided) - many('grey')} labelled frames {many('accepted_in')} were accepted at "
+        f"{len(decided) - many('grey')} judged frames {many('accepted_in')} were accepted at "
         f"the right place and {many('accepted_wrong')} at a wrong place; "
         f"{int((accepted & is_out).sum())} of {int(is_out.sum())} map-out frames were accepted, "
         f"{int((rejected & is_in).sum())} of {int(is_in.sum())} in-map frames rejected, "

@@ -38,6 +38,7 @@ from taojax.core.history import (
 )
 from taojax.core.path import Support, Window, support
 from taojax.core.se2 import between, compose, inverse, transform
+from taojax.errors import InputError
 from taojax.risk import Detector, first_look
 from taojax.runtime.frames import Frame, check_frame
 from taojax.runtime.maps import MapTables, rescale
@@ -709,9 +710,16 @@ def smooth(
         the `FEATURES` of each, NumPy.
 
     Raises:
-        InputError: arrays of a wrong shape or type.
+        InputError: arrays of a wrong shape or type, or rows that the map lacks.
     """
     check_frame(frames, axes=1)
+    index, n_map = np.asarray(frames.index), int(tables.places.n_known)
+    if (beyond := np.argwhere(index >= n_map)).size:
+        t, rank = (int(at) for at in beyond[0])
+        raise InputError(
+            f"frames.index: frame {t}, rank {rank} is {index[t, rank]}, but the map has rows 0 to"
+            f" {n_map - 1}; is it the same map? -1 = no candidate"
+        )
     settings = config.verdict if isinstance(config, Config) else config
     seen = clean(tables, *map(np.asarray, (frames.odometry, frames.index, frames.similarity)))
     return replay_both(settings, tables, seen, progress=progress)

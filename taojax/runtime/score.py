@@ -228,7 +228,7 @@ def verdicts(
         The columns of data_specs/verdicts.toml, `(T,)` each; the same as `taojax score` seals.
 
     Raises:
-        InputError: arrays of a wrong shape or type.
+        InputError: arrays of a wrong shape or type, or rows that the map lacks.
     """
     check_frame(frames, axes=1)
     both = hindsight.smooth(config, tables, frames, progress=progress)
