@@ -127,8 +127,11 @@ def test_the_judge_of_another_run_is_refused(judged, tmp_path):
         taojax.read_run(other, judged=judged[0])
 
 
-def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"manifest\.json: no such file"):
+def test_a_folder_that_is_no_run_is_refused_and_runs_within_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"holds no run \(manifest\.json\); name another"):
+        taojax.read_run(tmp_path)
+    seal(tmp_path)
+    with pytest.raises(InputError, match=r"holds no run \(manifest\.json\); name one: "):
         taojax.read_run(tmp_path)
 
 
