@@ -74,7 +74,9 @@ def unlike(one: np.ndarray, other: np.ndarray) -> float:
     one, other = np.asarray(one), np.asarray(other)
     if not np.issubdtype(one.dtype, np.floating):
         return float((one != other).mean())
-    known = np.isfinite(one) & np.isfinite(other)
+    known = np.isfinite(one)
+    if (known != np.isfinite(other)).any():
+        return float("inf")
     largest = max(1e-6, float(np.abs(other[known]).max(initial=0.0)))
     return float(np.abs(one - other)[known].max(initial=0.0) / largest)
 

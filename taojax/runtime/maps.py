@@ -141,7 +141,7 @@ def _spread_rows(xy: np.ndarray) -> np.ndarray:
 NEIGHBOURS = 12
 """Anchors that mass spreads to from each anchor."""
 
-LISTED = 4
+PER_CELL = 4
 """Anchors that a cell of the filter's grid lists at most. On eight recorded maps .5 % of the cells
 in reach are near to more, and list those that most of the cell is near to."""
 
@@ -269,7 +269,7 @@ def _grid(poses: np.ndarray, spacing_m: float) -> AnchorGrid:
     is_coarse = cell_m > spacing_m
     # From the corner of a coarse cell an anchor must be found as from that of a fine one.
     reach += np.sqrt(0.5) * (cell_m - spacing_m)
-    listed = _listed(tree, points, cell_m, reach, NEIGHBOURS if is_coarse else LISTED)
+    listed = _listed(tree, points, cell_m, reach, NEIGHBOURS if is_coarse else PER_CELL)
     # Padded, because every length of this table is compiled for anew.
     room = capacity(len(points), LEAST_CELLS, CELLS_GROWTH) - len(points)
     gap, neighbour = tree.query(xy, k=min(NEIGHBOURS, len(xy)))

@@ -275,10 +275,7 @@ class Watch:
     def _seen(self, seen: Observed, start: float) -> dict[str, Any]:
         frame = Frame(*(jnp.asarray(leaf) for leaf in seen[1:]))
         self._state, record = step(self._literal, self._tables, self._state, frame)
-        clean = hindsight.clean(
-            self._tables, seen.odometry[None], seen.rows[None], seen.similarity[None]
-        )
-        now = self._follower.push(jax.tree.map(lambda leaf: leaf[0], clean))
+        now = self._follower.push(hindsight.clean(self._tables, *seen[1:]))
         said = self._said(seen.t_s, jax.device_get(record), now)
         self._n_frames += 1
         said["latency_ms"] = round(1e3 * (time.perf_counter() - start), 3)
