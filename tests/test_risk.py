@@ -453,12 +453,51 @@ def test_a_short_half_is_measured_and_not_proven(rng):
     assert "360 accepted answers without a wrong one would prove it" in fitted.promise
 
 
-def test_refining_never_raises_a_level(rng):
+def test_refining_raises_no_level_that_accepts_nearly_all(rng):
     split, own = half("r" * 200 + "w" * 20, apart=3.0, rng=rng)
     fitted = judge.refine(FINAL, split, own, 0.05)
     for mine, pooled in zip(fitted.levels, FINAL.levels, strict=True):
         assert np.isnan(mine) or mine <= pooled
     assert np.isnan(fitted.levels[0])
+
+
+def raised(right, wrong):
+    """Return the level of a half whose answers have these probabilities, as if it taught nothing."""
+    numbers = NOW._replace(weight=np.array([1.0, 0.0]), bias=0.0)
+    p = np.r_[right, wrong]
+    is_wrong = np.arange(len(p)) >= len(right)
+    z = np.stack([np.log(p / (1.0 - p)), np.zeros(len(p))], axis=1)
+    split, own = fitted_on(z, is_wrong)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judge, "moved", lambda numbers, z, is_wrong: numbers)
+        return judge.refine(numbers, split, own, 0.05).level / NOW.level
+
+
+def test_a_half_with_enough_trusted_answers_raises_the_level_until_nine_in_ten_are_accepted():
+    trusted, doubted = np.linspace(0.01, 0.99 * NOW.level, 30), np.linspace(1.1, 1.9, 9) * NOW.level
+    # Nine in ten of 39 are 36, the sixth of the doubted.
+    assert raised(np.r_[trusted, doubted], [0.9]) == pytest.approx(1.6)
+    # At most twice as high, however many are doubted.
+    assert raised(np.r_[trusted, doubted, np.full(40, 0.45)], [0.9]) == pytest.approx(2.0)
+    # A wrong answer in between: four times 1 in 33 + 4 is more than .05.
+    assert raised(np.r_[trusted, doubted], [1.35 * NOW.level]) == pytest.approx(1.3)
+
+
+def test_the_pooled_level_stands_where_a_half_has_nothing_to_gain_or_too_little_to_show():
+    doubted = np.linspace(1.1, 1.9, 9) * NOW.level
+    # 90 of 99 are accepted as it is.
+    assert raised(np.r_[np.linspace(0.01, 0.99 * NOW.level, 90), doubted], [0.9]) == 1.0
+    few = np.linspace(0.01, 0.99 * NOW.level, 19)
+    assert raised(np.r_[few, doubted], [0.9]) == 1.0
+    assert raised(np.r_[few, [0.05], doubted], [0.9]) > 1.0
+
+
+def test_what_is_more_likely_wrong_than_right_is_never_accepted():
+    own = own_of("r" * 100)
+    p = np.linspace(0.2, 0.8, 100)
+    assert judge.may_rise(p, own, 0.4) == 0.5
+    assert judge.may_rise(p, own, 0.3) == 0.3
+    assert np.isnan(judge.may_rise(p, own, np.nan))
 
 
 # tables/verdicts.csv.
