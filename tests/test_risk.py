@@ -462,7 +462,7 @@ def test_refining_raises_no_level_that_accepts_nearly_all(rng):
 
 
 def raised(right, wrong):
-    """Return the level of a half whose answers have these probabilities, as if it taught nothing."""
+    """Return the level of a half with these probabilities, over the pooled one."""
     numbers = NOW._replace(weight=np.array([1.0, 0.0]), bias=0.0)
     p = np.r_[right, wrong]
     is_wrong = np.arange(len(p)) >= len(right)

@@ -23,11 +23,12 @@ LEAST_ACCEPTED = 3
 instead the recall on left-out recordings is .01 lower and no fewer accepted answers are wrong."""
 
 ENOUGH, RISE = 0.9, 2.0
-"""A half that accepts `LEAST_RIGHT` right answers up to the pooled level may raise it until so large
-a share of its right answers is accepted, and to so many times the pooled one at most. On left-out
-recordings recall goes from .752 to .779 with it (wrong .0175 and .0181), of causal answers from
-.725 to .746 (.026 and .027). With no share asked for .782, but radar_kaist01, whose half accepts
-.98 already, would buy one right answer for three wrong ones; at 2.5 times wrong is .033."""
+"""A half that accepts `LEAST_RIGHT` right answers up to the pooled level may raise it until it
+accepts so large a share of its right answers, and to so many times the pooled one at most. On
+left-out recordings recall goes from .752 to .779 with it (wrong .0175 and .0181), of causal answers
+from .725 to .746 (.026 and .027). Without the share it is .782, but radar_kaist01, whose half
+accepts .98 as it is, would buy two right answers for twelve wrong ones; at 2.5 times wrong is .033.
+"""
 
 FOLDS = 4
 """Parts of the calibration half, each judged by numbers fitted on the others before a level is
