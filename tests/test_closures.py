@@ -125,6 +125,28 @@ def test_a_closure_leads_from_its_map_pose_to_the_answered_pose(run):
         np.testing.assert_allclose(information, precision, rtol=1e-6, atol=1e-6)
 
 
+def test_the_table_of_closures_says_when_and_where_and_how_surely(run, verdict):
+    found, sealed = read_table(run / "closures.csv", "closure_list"), records.read_run(run)
+    rows = np.flatnonzero(verdict == "accept")
+    assert found["frame"].tolist() == rows.tolist()
+    named = sealed.decisions["map_index"][rows].astype(int)
+    assert found["map_index"].tolist() == named.tolist()
+    np.testing.assert_allclose(found["t_s"], sealed.signals["t_s"][rows])
+    np.testing.assert_allclose(found["map_t_s"], sealed.map_poses["t_s"][named])
+    for name in ("x_m", "y_m", "theta_rad", "probability_wrong"):
+        np.testing.assert_allclose(found[name], sealed.decisions[name][rows], rtol=1e-6)
+    # What the graph's edge holds, turned back into the axes of the map.
+    _, edges = read_g2o(run / "closures.g2o")
+    closed = {b - 60: information for a, b, _, information in edges if a < 60 <= b}
+    for k, t in enumerate(rows.tolist()):
+        own = np.linalg.inv(closed[t])
+        turn = matrix([0, 0, found["theta_rad"][k]])
+        there = turn @ own @ turn.T
+        want = [found[name][k] for name in ("var_x_m2", "var_y_m2", "cov_xy_m2", "var_theta_rad2")]
+        got = [there[0, 0], there[1, 1], there[0, 1], there[2, 2]]
+        np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-6)
+
+
 def test_the_maps_own_edges_keep_it_as_it_is(run):
     vertices, edges = read_g2o(run / "closures.g2o")
     for a, b, motion, _ in edges[:59]:
@@ -258,7 +280,7 @@ def test_the_judge_who_knows_the_place_comes_first(scored, tmp_path, capsys):
     # The first two frames have no answer that could close anything.
     assert "48 accepted closures" in said
     names = {path.name for path in out.iterdir()}
-    assert names == {"closures.g2o", "rejected.g2o", "trajectory.tum"}
+    assert names == {"closures.g2o", "closures.csv", "rejected.g2o", "trajectory.tum"}
 
 
 def test_every_frame_is_counted_once(run, tmp_path, capsys):

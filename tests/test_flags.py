@@ -14,7 +14,7 @@ from test_cli import VERBS, fails
 from taojax import cli
 from taojax.cli import convert_flags, main, renamed
 from taojax.cli.audit import Audit
-from taojax.cli.common import Compiling, told
+from taojax.cli.common import Compiling, draws_bars, told
 
 SETS = (
     "Sthereo", "Kri", "Mulran", "ComplexUrban", "Robotcar", "Vivid", "Folder", "Files", "Self"
@@ -209,3 +209,11 @@ def test_a_command_goes_on_whether_or_not_it_keeps_what_it_compiles():
     from taojax.config import Config
 
     assert told(Audit(cache=False, progress=False), Config()) == told(Audit(), Config())
+
+
+@pytest.mark.parametrize(("asked", "is_terminal", "drawn"), [
+    (True, True, True), (True, False, False), (False, True, False),
+])  # fmt: skip
+def test_bars_are_drawn_for_people_alone(asked, is_terminal, drawn, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
+    assert draws_bars(asked) is drawn

@@ -216,13 +216,30 @@ def test_images_named_by_time_find_poses_of_any_rate(tmp_path):
 @pytest.mark.parametrize(("name", "seconds"), [
     ("1600000000", 1.6e9), ("1600000000.5", 1600000000.5), ("1600000000500", 1600000000.5),
     ("1600000000500000", 1600000000.5), ("1600000000500000000", 1600000000.5),
-    ("1001", None), ("1_1600000000", None), ("16000000005.5", None),
+    ("1001", None), ("16000000005.5", None), ("160000000", None), ("1600000000_1600000001", None),
 ])  # fmt: skip
 def test_names_that_are_unix_times_are_read_as_such(name, seconds, tmp_path):
     for first in "189":
         (tmp_path / f"{first}{name[1:]}.png").write_bytes(b"x")
     t_s = images_of(tmp_path).t_s
     assert (t_s is None) if seconds is None else (t_s[0] == seconds)
+
+
+@pytest.mark.parametrize("name", [
+    "frame_{}.500000000", "thermal-{}.5-left", "{}_500000000", "cam0_{}-500000000", "{}500",
+    "l{}500000000r",
+])  # fmt: skip
+def test_a_time_inside_a_longer_name_is_read_too(name, tmp_path):
+    for second in range(1600000000, 1600000003):
+        (tmp_path / f"{name.format(second)}.png").write_bytes(b"x")
+    np.testing.assert_allclose(images_of(tmp_path).t_s, 1600000000.5 + np.arange(3), rtol=1e-12)
+
+
+def test_ten_digits_that_count_frames_are_no_times(tmp_path):
+    """Raw KITTI counts frames in ten digits."""
+    for k in range(3):
+        (tmp_path / f"{k:010d}.png").write_bytes(b"x")
+    assert images_of(tmp_path).t_s is None
 
 
 def test_images_without_times_go_with_rows_and_it_is_said(tmp_path):

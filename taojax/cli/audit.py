@@ -14,6 +14,7 @@ from taojax.cli.common import (
     Scenario,
     Scoring,
     config_of,
+    draws_bars,
     flag,
     out_of,
     say,
@@ -81,13 +82,13 @@ def run(args: Audit) -> None:
         _audit_images(args, out, config)
         return
     if args.dataset is not None and is_ready:
-        _audit_folder(args.dataset, out, config, progress=args.progress)
+        _audit_folder(args.dataset, out, config, progress=draws_bars(args.progress))
         return
     with claimed(out, told(args, config)):
         if args.dataset is not None:
             _audit_converted(args, out, config)
         else:
-            _audit_world(args.scenario, out, config, progress=args.progress)
+            _audit_world(args.scenario, out, config, progress=draws_bars(args.progress))
 
 
 def _check(args: Audit) -> None:
@@ -135,10 +136,12 @@ def _audit_images(args: Audit, out: Path, config: "Config") -> None:
 
     if not (out / "manifest.json").is_file():
         refuse_if_taken(out)
-    data, truth_csv = make(args.from_images, out.parent / FOLDER, progress=args.progress)
+    data, truth_csv = make(
+        args.from_images, out.parent / FOLDER, progress=draws_bars(args.progress)
+    )
     if (out / "manifest.json").is_file() and not is_sealed(out, data, config):
         raise InputError(f"{out}: holds a run of other images, files or flags; choose a new --out")
-    score_apart([Scoring(data, out)], config, progress=args.progress)
+    score_apart([Scoring(data, out)], config, progress=drawn)
     if truth_csv is None:
         say("nothing is judged: no --truth; the calibration that ships with taojax decided. The"
             " same command with --truth FILE and another --out judges it")  # fmt: skip
@@ -164,7 +167,7 @@ def _convert(args: Audit, data: Path, seed: int) -> None:
 
 def _audit_converted(args: Audit, out: Path, config: "Config") -> None:
     """Make of DATASET what can be audited, in out/data, then audit that."""
-    data, scored, progress = out / "data", out / "scored", args.progress
+    data, scored, progress = out / "data", out / "scored", draws_bars(args.progress)
     if not data.exists():
         _convert(args, data, config.seed)
     if not is_sealed(out, data, config):

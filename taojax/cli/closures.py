@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Closures:
-    """Write what was accepted and rejected as g2o and TUM, for GTSAM, g2o, RTAB-Map and evo.
+    """Write what was accepted and rejected as g2o, CSV and TUM, for GTSAM, g2o, RTAB-Map and evo.
 
     Example: taojax closures runs/mine
     """
@@ -24,7 +24,7 @@ class Closures:
     """Run folder with verdicts: scored or audited."""
 
     out: Annotated[Path | None, flag("DIR", "RUN")] = None
-    """Where to write closures.g2o, rejected.g2o and trajectory.tum."""
+    """Where to write closures.g2o, closures.csv, rejected.g2o and trajectory.tum."""
 
     max_wrong: Annotated[float | None, flag("SHARE", "as decided")] = None
     """Share of the accepted closures that may be wrong; decides again by the run's numbers."""
@@ -35,7 +35,14 @@ class Closures:
 
 def run(args: Closures) -> None:
     """Write the files."""
-    from taojax.files.pose_graph_io import at_share, build_graph, g2o_text, read_verdicts, tum_text
+    from taojax.files.pose_graph_io import (
+        at_share,
+        build_graph,
+        closure_text,
+        g2o_text,
+        read_verdicts,
+        tum_text,
+    )
     from taojax.files.records import read_run
     from taojax.files.specs import write_atomically
 
@@ -53,6 +60,7 @@ def run(args: Closures) -> None:
     trajectory, told = tum_text(graph), _of_the_audit(args.run, verdicts)
     files = {
         "closures.g2o": g2o_text(graph, "accept"),
+        "closures.csv": closure_text(graph, sealed, verdicts),
         "rejected.g2o": g2o_text(graph, "reject"),
         "trajectory.tum": trajectory,
     }
@@ -66,7 +74,7 @@ def run(args: Closures) -> None:
         vertices = f"vertices 0 to {n_query - 1} are the drive's"
     again = "" if args.max_wrong is None else ", decided again,"
     print(f"verdicts of {verdicts.source}{again} on {n_frames} frames; {vertices} frames")
-    print(f"closures.g2o    {n['accept']} accepted closures")
+    print(f"closures.g2o    {n['accept']} accepted closures; closures.csv, with time stamps")
     print(f"rejected.g2o    {n['reject']} rejected ones, to look at")
     print(f"left out        {n['abstain']} on which nothing was decided, "
           f"{n_frames - n_posed} without a pose")  # fmt: skip

@@ -74,7 +74,12 @@ class Common(Compiling):
     """Seed of the simulated world and of the bootstrap."""
 
     progress: bool = True
-    """Draw progress bars."""
+    """Draw progress bars; never where stderr is a file or a pipe."""
+
+
+def draws_bars(progress: bool) -> bool:
+    """Return whether to draw progress bars: they are asked for, and a person is there to watch."""
+    return progress and sys.stderr.isatty()
 
 
 def say(text: str) -> None:

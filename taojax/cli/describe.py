@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.cli.common import flag, say
+from taojax.cli.common import draws_bars, flag, say
 from taojax.errors import UsageError
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def describe_folder(images: Path, out: Path, flags: Describing, *, progress: boo
 
 def run(args: Describe) -> None:
     """Describe and say what comes next."""
-    made = describe_folder(args.images, args.out, args, progress=args.progress)
+    made = describe_folder(args.images, args.out, args, progress=draws_bars(args.progress))
     resumed = f", {made.n_resumed:,} of them from an interrupted run" if made.n_resumed else ""
     say(f"{made.n_images:,} images ({made.kind}), in the order of their {made.order}{resumed}")
     say(f"wrote {args.out}: {made.n_images:,} x {made.dimension:,}; how: {args.out.stem}.toml")

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import tyro
 
-from taojax.cli.common import Common, Scoring, config_of, flag, out_of, say, score_apart, told
+from taojax.cli.common import (
+    Common,
+    Scoring,
+    config_of,
+    draws_bars,
+    flag,
+    out_of,
+    say,
+    score_apart,
+    told,
+)
 from taojax.cli.resume import claimed
 from taojax.errors import InputError, UsageError
 
@@ -90,7 +100,7 @@ def run(args: Kidnap) -> None:
 def _carry(args: Kidnap, config: "Config", out: Path) -> None:
     """Fill a folder with logs, their sealed runs and what the judge makes of them."""
     jobs = _simulated(args, config, out) if args.dataset is None else _recorded(args, config, out)
-    parts = _score_all(jobs, out, config, progress=args.progress)
+    parts = _score_all(jobs, out, config, progress=draws_bars(args.progress))
     from taojax.audit.recovery_report import write_recovery
 
     say("judging")

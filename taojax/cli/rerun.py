@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
-from taojax.cli.common import Compiling, flag, say
+from taojax.cli.common import Compiling, draws_bars, flag, say
 from taojax.cli.from_images import FOLDER
 from taojax.errors import GateError, InputError
 
@@ -81,7 +81,7 @@ def run(args: Rerun) -> None:
             from_toml(args.run / "config.toml"),
             calibration=_calibration(args.run, sealed),
             rival_logs=_rival_logs(sealed),
-            progress=args.progress,
+            progress=draws_bars(args.progress),
         )
         verdicts = _compare(args.run, out, sealed.manifest["sha256"], manifest["sha256"])
     width = max(len(name) for name in verdicts)

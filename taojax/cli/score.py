@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from taojax.cli.common import Common, Dataset, config_of, flag, out_of, say
+from taojax.cli.common import Common, Dataset, config_of, draws_bars, flag, out_of, say
 from taojax.cli.layout import check_layout
 from taojax.errors import UsageError
 
@@ -55,7 +55,7 @@ def run(args: Score) -> None:
         config,
         calibration=calibration,
         rival_logs=rival_logs,
-        progress=args.progress,
+        progress=draws_bars(args.progress),
     )
     for note in manifest["notes"]:
         say(f"note: {note}")

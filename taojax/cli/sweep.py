@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from taojax.cli.common import Common, config_of, flag, out_of, run_apart, say
+from taojax.cli.common import Common, config_of, draws_bars, flag, out_of, run_apart, say
 from taojax.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,10 +58,10 @@ def run(args: Sweep) -> None:
         raise InputError(f"{truth}: no such file; add it, or add --no-judge")
     try:
         if not args.judge:
-            _compute(dataset, out, config, grid, progress=args.progress)
+            _compute(dataset, out, config, grid, progress=draws_bars(args.progress))
             return
         if not is_sealed:
-            _compute_apart(dataset, out, config, grid, progress=args.progress)
+            _compute_apart(dataset, out, config, grid, progress=draws_bars(args.progress))
     except KeyboardInterrupt:
         say(f"taojax: interrupted; run the same command again to continue, with --out {out}")
         raise SystemExit(130) from None

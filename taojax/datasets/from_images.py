@@ -1,10 +1,12 @@
 """Two folders of images as two sessions: which image has which pose, or which motion.
 
-Images named by UNIX time are matched by it; others are as many as rows and follow their order.
+Images whose names hold a UNIX time are matched by it; others are as many as rows and follow their
+order.
 """
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +31,11 @@ __all__ = ["Images", "images_of", "key_of", "map_session", "query_session", "row
 UNIT_OF = {10: "s", 13: "ms", 16: "us", 19: "ns"}
 """Unit of a UNIX time of so many digits, from 2001 to 2286."""
 
+_UNIX = re.compile(
+    r"(?<![\d.])(?:([1-9]\d{9}\.\d+)|([1-9]\d{9})[-_](\d{9})|([1-9](?:\d{9}|\d{12}|\d{15}|\d{18})))(?!\d)"
+)
+"""Seconds with decimals, seconds and nanoseconds, or one number; a leading zero counts frames."""
+
 TIMED = "images were taken when their names say, in UNIX time"
 
 FIX = "store one row per image in the order of their names, or name images by their UNIX time"
@@ -43,7 +50,7 @@ class Images(NamedTuple):
     """Relative to the folder."""
 
     t_s: Float[np.ndarray, " n"] | None
-    """When each was taken, where all names are UNIX times [s]."""
+    """When each was taken, where all names hold a UNIX time [s]."""
 
 
 def images_of(folder: Path) -> Images:
@@ -64,14 +71,14 @@ def images_of(folder: Path) -> Images:
 
 
 def _unix_s(stem: str) -> float | None:
-    """Return the UNIX time that a name is, such as 1600000000.25 or 1600000000250000000."""
-    whole, dot, part = stem.partition(".")
-    unit = UNIT_OF.get(len(whole))
-    if not (whole.isascii() and whole.isdigit()) or unit is None:
+    """Return the only UNIX time in a name, such as frame_1600000000.25 or 1600000000250000000."""
+    found = _UNIX.findall(stem)
+    if len(found) != 1:
         return None
-    if dot and not (unit == "s" and part.isascii() and part.isdigit()):
-        return None
-    return float(stem) if dot else int(whole) / PER_S[unit]
+    decimal, seconds, nanoseconds, whole = found[0]
+    if whole:
+        return int(whole) / PER_S[UNIT_OF[len(whole)]]
+    return float(decimal) if decimal else int(seconds) + int(nanoseconds) / PER_S["ns"]
 
 
 def map_session(images: Images, poses: Path, reading: Reading, matching: Matching) -> Session:

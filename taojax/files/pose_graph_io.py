@@ -19,7 +19,7 @@ from taojax.decisions import decide
 from taojax.errors import InputError
 from taojax.files.records import Run
 from taojax.files.specs import fail, read_text
-from taojax.files.tables import MOTION, POSE, read_frames, read_table, stacked
+from taojax.files.tables import MOTION, POSE, read_frames, read_table, stacked, table_text
 from taojax.risk import Calibration, for_run, read_calibration
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "at_share",
     "between",
     "build_graph",
+    "closure_text",
     "compose",
     "g2o_text",
     "in_axes_of",
@@ -379,6 +380,27 @@ def g2o_text(graph: Graph, verdict: str) -> str:
         ),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def closure_text(graph: Graph, run: Run, verdicts: Verdicts) -> str:
+    """Return the accepted closures as a table, each with both time stamps and its covariance."""
+    rows = graph.rows("accept")
+    # Row m of the map of one drive that closes on itself is frame m.
+    map_t_s = graph.t_s if graph.is_own else run.map_poses["t_s"]
+    covariance = graph.covariance[rows]
+    table = {
+        "frame": rows,
+        "t_s": graph.t_s[rows],
+        "map_index": graph.map_index[rows],
+        "map_t_s": map_t_s[graph.map_index[rows]],
+        **dict(zip(POSE, graph.pose[rows].T, strict=True)),
+        "probability_wrong": verdicts.probability[rows],
+        "var_x_m2": covariance[:, 0, 0],
+        "var_y_m2": covariance[:, 1, 1],
+        "cov_xy_m2": covariance[:, 0, 1],
+        "var_theta_rad2": covariance[:, 2, 2],
+    }
+    return table_text("closure_list", table)
 
 
 def tum_text(graph: Graph) -> str:
