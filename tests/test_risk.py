@@ -473,20 +473,21 @@ def raised(right, wrong):
         return judge.refine(numbers, split, own, 0.05).level / NOW.level
 
 
-def test_a_half_with_enough_trusted_answers_raises_the_level_until_nine_in_ten_are_accepted():
-    trusted, doubted = np.linspace(0.01, 0.99 * NOW.level, 30), np.linspace(1.1, 1.9, 9) * NOW.level
-    # Nine in ten of 39 are 36, the sixth of the doubted.
-    assert raised(np.r_[trusted, doubted], [0.9]) == pytest.approx(1.6)
-    # At most twice as high, however many are doubted.
-    assert raised(np.r_[trusted, doubted, np.full(40, 0.45)], [0.9]) == pytest.approx(2.0)
-    # A wrong answer in between: four times 1 in 33 + 4 is more than .05.
-    assert raised(np.r_[trusted, doubted], [1.35 * NOW.level]) == pytest.approx(1.3)
+def test_a_half_with_enough_trusted_answers_raises_the_level_until_enough_are_accepted():
+    trusted = np.linspace(0.01, 0.99 * NOW.level, 31)
+    doubted = np.linspace(1.1, 1.6, 9) * NOW.level
+    # 95 in a hundred of 40 are 38, the seventh of the doubted.
+    assert raised(np.r_[trusted, doubted], [0.9]) == pytest.approx(1.475)
+    # At most 5/3 as high, however many are doubted.
+    assert raised(np.r_[trusted, doubted, np.full(40, 0.45)], [0.9]) == pytest.approx(5 / 3)
+    # A wrong answer in between: four times 1 in 34 + 4 is more than .05.
+    assert raised(np.r_[trusted, doubted], [1.25 * NOW.level]) == pytest.approx(1.225)
 
 
 def test_the_pooled_level_stands_where_a_half_has_nothing_to_gain_or_too_little_to_show():
-    doubted = np.linspace(1.1, 1.9, 9) * NOW.level
-    # 90 of 99 are accepted as it is.
-    assert raised(np.r_[np.linspace(0.01, 0.99 * NOW.level, 90), doubted], [0.9]) == 1.0
+    doubted = np.linspace(1.1, 1.6, 5) * NOW.level
+    # 95 of 100 are accepted as it is.
+    assert raised(np.r_[np.linspace(0.01, 0.99 * NOW.level, 95), doubted], [0.9]) == 1.0
     few = np.linspace(0.01, 0.99 * NOW.level, 19)
     assert raised(np.r_[few, doubted], [0.9]) == 1.0
     assert raised(np.r_[few, [0.05], doubted], [0.9]) > 1.0
