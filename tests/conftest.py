@@ -35,6 +35,57 @@ def pytest_sessionstart():
                 entry.unlink()
 
 
+KEPT = []
+
+
+def _surroundings():
+    """Return what an interpreter takes over from the one that starts it."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    streams = [(os.fstat(fd).st_dev, os.fstat(fd).st_ino) for fd in (1, 2)]
+    return os.getcwd(), own, streams
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kept_child():
+    """Keep one interpreter for the verbs of many tests: most of their time is start and compiling.
+
+    It is what a command that scores many data folders does anyway; after a failure it ends.
+    """
+    from taojax.cli import child
+
+    run, end, start = child.run, child._end, child.start
+
+    def borrow():
+        if KEPT:
+            other, surroundings = KEPT.pop()
+            if other.process.poll() is None and surroundings == _surroundings():
+                return other
+            end([other])
+        return start()
+
+    def run_and_keep(commands, most=1):
+        done, code = [], 1
+        child.start, child._end = borrow, done.extend
+        try:
+            code = run(commands, most)
+        finally:
+            child.start, child._end = start, end
+            if code == 0 and done and not KEPT:
+                KEPT.append((done.pop(), _surroundings()))
+            end(done)
+        return code
+
+    child.run = run_and_keep
+    yield
+    child.run = run
+
+
+def pytest_sessionfinish():
+    """Let it end; its pipe would do the same."""
+    for other, _ in KEPT:
+        other.close()
+
+
 @pytest.fixture
 def rng(request):
     """A generator seeded by the test's own name: one seed per test, the same every time."""

@@ -30,6 +30,11 @@ child.run([sys.argv[1:]])
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def kept_child():
+    """Keep none: here it is told when interpreters begin and end."""
+
+
 def is_alive(pid):
     """Tell whether a process runs; one that only waits to be reaped does not."""
     try:

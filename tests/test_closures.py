@@ -1,5 +1,6 @@
 """Closures as files: a strict g2o reader, a strict TUM reader, and evo where it is installed."""
 
+import dataclasses
 import json
 import os
 import re
@@ -145,6 +146,17 @@ def test_the_table_of_closures_says_when_and_where_and_how_surely(run, verdict):
         want = [found[name][k] for name in ("var_x_m2", "var_y_m2", "cov_xy_m2", "var_theta_rad2")]
         got = [there[0, 0], there[1, 1], there[0, 1], there[2, 2]]
         np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-6)
+
+
+def test_stamps_of_the_map_keep_their_digits(run):
+    sealed = records.read_run(run)
+    unix = sealed.map_poses | {"t_s": 1628226000.25 + np.arange(60) * 0.5}
+    verdicts = pose_graph_io.read_verdicts(run, sealed)
+    made = pose_graph_io.build_graph(run, sealed, verdicts)
+    text = pose_graph_io.closure_text(made, dataclasses.replace(sealed, map_poses=unix), verdicts)
+    rows = [line.split(",") for line in text.splitlines()[1:]]
+    assert len(rows) > 10
+    assert all(float(row[3]) == unix["t_s"][int(row[2])] for row in rows)
 
 
 def test_the_maps_own_edges_keep_it_as_it_is(run):

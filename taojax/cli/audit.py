@@ -136,9 +136,8 @@ def _audit_images(args: Audit, out: Path, config: "Config") -> None:
 
     if not (out / "manifest.json").is_file():
         refuse_if_taken(out)
-    data, truth_csv = make(
-        args.from_images, out.parent / FOLDER, progress=draws_bars(args.progress)
-    )
+    drawn = draws_bars(args.progress)
+    data, truth_csv = make(args.from_images, out.parent / FOLDER, progress=drawn)
     if (out / "manifest.json").is_file() and not is_sealed(out, data, config):
         raise InputError(f"{out}: holds a run of other images, files or flags; choose a new --out")
     score_apart([Scoring(data, out)], config, progress=drawn)
@@ -192,8 +191,10 @@ def _judge(dataset: Path, out: Path, config: "Config") -> None:
     if "own_gap_m" in evaluation.judgement.manifest:
         say(f"next:   taojax closures {out}; taojax graph {out}")
         return
-    wrong = (evaluation.judgement.outcome == "accepted_wrong").nonzero()[0]
-    frame = wrong[-1] if wrong.size else len(evaluation.judgement.outcome) - 1
+    # What a user wants to understand first: a wrong closure, a lost one, or any.
+    outcome = evaluation.judgement.outcome
+    kinds = [outcome == kind for kind in ("accepted_wrong", "rejected_in", "accepted_in")]
+    frame = next((kind.nonzero()[0][-1] for kind in kinds if kind.any()), len(outcome) - 1)
     say(f"next:   taojax explain {out} --frame {frame}; taojax closures {out}")
 
 

@@ -96,7 +96,9 @@ def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
     accepted, where = verdicts.verdict == "accept", "all frames"
     if verdicts.source == "verdicts.csv":
         # Its numbers were fitted on the other half of the same run.
-        accepted, where = accepted & (labels["split"] == "test"), "the test half"
+        is_test = labels["split"] == "test"
+        where = f"the test half (the other {int((accepted & ~is_test).sum())} are not counted)"
+        accepted = accepted & is_test
     n, n_off = int(accepted.sum()), int((accepted & (labels["label"] == "map_out")).sum())
     return (
         f"audit           {n_off} of the {n} accepted of {where} lie off the map"

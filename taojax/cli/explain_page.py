@@ -72,7 +72,7 @@ def _frame(look: "Look", run: "Run") -> str:
     difference = abs(look.cost - look.sealed)
     how = "to nine digits" if difference < 1e-9 else f"to {difference:.1g}"
     return (
-        f"{look.frame} of 0 to {n - 1} (t = {float(t_s):.10g} s); the seal holds, and the path "
+        f"{look.frame} of 0 to {n - 1} (t = {float(t_s):.13g} s); the seal holds, and the path "
         f"followed again costs what was sealed {how}"
     )
 

@@ -233,7 +233,7 @@ def format_number(value: float, column: Mapping[str, Any]) -> str:
         return ""
     if column.get("type") == "int":
         return str(int(value))
-    if column["name"] == "t_s":
+    if column["name"].endswith("t_s"):
         return repr(float(value))  # nine digits of UNIX time are tens of seconds
     return repr(float(f"{value:.9g}"))
 
