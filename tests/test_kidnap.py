@@ -1,12 +1,11 @@
 """Spliced kidnap logs: what the generator promises, and the command on top of it."""
 
+import contextlib
 import csv
 import dataclasses
+import io
 import itertools
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -265,23 +264,15 @@ def test_an_odd_trial_length_is_refused(body, tmp_path, source):
 FLAGS = ["--window", "6", "--branches", "5", "--r-in", "8", "--no-progress"]
 
 
-def command(*words):
-    env = os.environ | {"JAX_PLATFORMS": "cpu"}
-    return subprocess.run(
-        [sys.executable, "-m", "taojax", "kidnap", *words],
-        env=env, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def done(tmp_path_factory, source):
     folder = tmp_path_factory.mktemp("kidnap")
     write_source(folder / "data", source)
     words = ["--trials", "4", "--rival-trials", "0", "--association", "rank", *FLAGS]
     words += ["--out", str(folder / "run")]
-    result = command(str(folder / "data"), *words)
-    assert result.returncode == 0, result.stderr
-    return folder / "run", result.stdout
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["kidnap", str(folder / "data"), *words]) == 0
+    return folder / "run", said.getvalue()
 
 
 def test_the_command_writes_every_file(done):
