@@ -265,7 +265,7 @@ def first_to_toml(detectors: Mapping[str, Detector]) -> str:
 def to_toml(calibration: Calibration) -> str:
     """Return a calibration as text that `read_calibration` reads back unchanged."""
     lines = [
-        "# Written by `taojax evaluate`; read by `taojax score --calibration FILE`.",
+        "# Written by taojax; read by `taojax score --calibration FILE`.",
         f"schema = {SCHEMA}",
         "",
         *_section("now", calibration.now),

@@ -55,13 +55,16 @@ def test_the_robot_program_runs_as_printed(rng):
     names = {
         "map_poses": loop(30),
         "map_descriptors": rng.normal(size=(30, 8)).astype(np.float32),
-        "odometry": jnp.array([1.0, 0.0, 0.1]),
-        "index": jnp.arange(20),
-        "similarity": jnp.linspace(0.9, 0.1, 20),
     }
+    lists = jnp.arange(20), jnp.linspace(0.9, 0.1, 20)
+    names["frames"] = [taojax.Frame(jnp.array([1.0, 0.0, 0.1]), *lists)] * 24
     exec(BLOCKS[1], names)
-    assert names["now"]["verdict"] == "abstain"
-    assert names["closures"] == []
+    assert names["now"]["frame"] == 23
+    frames = [final["frame"] for final in names["closures"]]
+    assert frames == sorted(set(frames))
+    # Nothing is left: every frame has had its final verdict, the last ones by flush.
+    assert names["watch"].flush() == names["watch"].finals() == []
+    assert not names["watch"]._waiting
     assert taojax.STATUSES[int(names["record"].status)] == "warming_up"
 
 

@@ -117,7 +117,7 @@ def _decided(look: "Look", run: "Run", verdicts: "Verdicts | None") -> str:
     )
     least = lone_doubt(risk, {name: run.delayed[name] for name in risk.reads})[look.frame]
     if least:
-        said += f"; it stands alone, so wrong with probability {least:.3f} at least"
+        said += f"; it stands alone, so wrong with at least probability {least:.3f}"
     return said
 
 

@@ -325,7 +325,10 @@ class Watch:
             verdict, why, p = judged(self._calibration.final, columns, status)
             for at, (t_s, said, verdict_now) in enumerate(before):
                 is_known = said not in SILENT
-                pose = [short(float(columns[name][at])) for name in POSE]
+                pose, spread = (
+                    [short(float(columns[name][at])) for name in names] if is_known else None
+                    for names in (POSE, COVARIANCE)
+                )
                 lines.append({
                     "kind": "final",
                     "frame": block.first + at,
@@ -333,8 +336,8 @@ class Watch:
                     "verdict": str(verdict[at]),
                     "withdrawn": verdict_now == "accept" and verdict[at] != "accept",
                     "map_index": int(columns["map_index"][at]) if is_known else -1,
-                    "pose": pose if is_known else None,
-                    "covariance": [short(float(columns[n][at])) for n in COVARIANCE],
+                    "pose": pose,
+                    "covariance": spread,
                     "probability_wrong": short(float(p[at])),
                     "reason": str(why[at]),
                 })  # fmt: skip
