@@ -142,8 +142,10 @@ def _audit_images(args: Audit, out: Path, config: "Config") -> None:
         raise InputError(f"{out}: holds a run of other images, files or flags; choose a new --out")
     score_apart([Scoring(data, out)], config, progress=drawn)
     if truth_csv is None:
-        say("nothing is judged: no --truth; the calibration that ships with taojax decided. The"
-            " same command with --truth FILE and another --out judges it")  # fmt: skip
+        say(
+            "nothing is judged: no --truth; the calibration that ships with taojax decided. The same"
+            " command with --truth FILE judges it; with --out, name another one beside this"
+        )
         say(decided(out))
         return
     write_atomically(data / TRUTH, truth_csv)

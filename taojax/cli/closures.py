@@ -79,6 +79,10 @@ def run(args: Closures) -> None:
     print(f"left out        {n['abstain']} on which nothing was decided, "
           f"{n_frames - n_posed} without a pose")  # fmt: skip
     print(f"trajectory.tum  {trajectory.count(chr(10))} accepted poses")
+    print(
+        "covariances     how far the position is spread within its place; an offset between the two"
+        " sessions is not in them"
+    )
     if told:
         print(told)
     for note in sealed.manifest["notes"]:
@@ -100,8 +104,11 @@ def _of_the_audit(run: Path, verdicts: "Verdicts") -> str | None:
         where = f"the test half (the other {int((accepted & ~is_test).sum())} are not counted)"
         accepted = accepted & is_test
     n, n_off = int(accepted.sum()), int((accepted & (labels["label"] == "map_out")).sum())
+    if 2 * n_off > n:
+        what = "; do not use these closures"
+    else:
+        what = ", where a right pose counts neither way" if n_off else ""
     return (
-        f"audit           {n_off} of the {n} accepted of {where} lie off the map"
-        f"{'; do not use these closures' if 2 * n_off > n else ''}; of the accepted, how many are"
-        " right: tables/verdicts.csv"
+        f"audit           {n_off} of the {n} accepted of {where} lie off the map{what}; of the"
+        " accepted, how many are right: tables/verdicts.csv"
     )
