@@ -143,8 +143,8 @@ def _audit_images(args: Audit, out: Path, config: "Config") -> None:
     score_apart([Scoring(data, out)], config, progress=drawn)
     if truth_csv is None:
         say(
-            "nothing is judged: no --truth; the calibration that ships with taojax decided. The same"
-            " command with --truth FILE judges it; with --out, name another one beside this"
+            "nothing is judged: no --truth; the calibration that ships with taojax decided. The"
+            " same command with --truth FILE judges it; with --out, name another one beside this"
         )
         say(decided(out))
         return
