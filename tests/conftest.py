@@ -81,9 +81,11 @@ def kept_child():
 
 
 def pytest_sessionfinish():
-    """Let it end; its pipe would do the same."""
+    """Let it end."""
     for other, _ in KEPT:
         other.close()
+        other.process.wait()
+        os.close(other.codes)
 
 
 @pytest.fixture

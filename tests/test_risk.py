@@ -496,9 +496,9 @@ def test_the_pooled_level_stands_where_a_half_has_nothing_to_gain_or_too_little_
 def test_what_is_more_likely_wrong_than_right_is_never_accepted():
     own = own_of("r" * 100)
     p = np.linspace(0.2, 0.8, 100)
-    assert judge.may_rise(p, own, 0.4) == 0.5
-    assert judge.may_rise(p, own, 0.3) == 0.3
-    assert np.isnan(judge.may_rise(p, own, np.nan))
+    assert judge.highest_level(p, own, 0.4) == 0.5
+    assert judge.highest_level(p, own, 0.3) == 0.3
+    assert np.isnan(judge.highest_level(p, own, np.nan))
 
 
 # tables/verdicts.csv.

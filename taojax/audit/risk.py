@@ -96,9 +96,9 @@ def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> R
         max_wrong: share of the accepted answers that may be wrong.
 
     Returns:
-        Weights half of the way from the pooled to the fitted ones. The level is the pooled one
-        (`may_rise`), or a lower one at which the accepted answers of this half keep the promise
-        though each wrong one counts `HARSHER` times; NaN, and a sentence why, where none does.
+        Weights half of the way from the pooled to the fitted ones. The level is the highest one at
+        which the accepted answers of this half keep the promise though each wrong one counts
+        `HARSHER` times, at most `highest_level`; NaN, and a sentence why, where none does.
     """
     table = np.stack([np.asarray(split.signals[name], float) for name in base.columns], axis=1)
     z, known = (table - base.mean) / base.scale, np.flatnonzero(own.is_right | own.is_wrong)
@@ -113,7 +113,7 @@ def refine(base: Risk, split: CalibrationSplit, own: Own, max_wrong: float) -> R
             apart = _moved(base, z[others], own.is_wrong[others])
             unseen[part] = probability_wrong(apart, there)
     levels = np.array([
-        checked_level(unseen, own, most, may_rise(unseen, own, level))
+        checked_level(unseen, own, most, highest_level(unseen, own, level))
         for level, most in zip(base.levels, base.max_wrongs, strict=True)
     ])  # fmt: skip
     refined = at_most(refined._replace(levels=levels), max_wrong)
@@ -126,7 +126,7 @@ def _moved(base: Risk, z: Float[np.ndarray, "n f"], is_wrong: Bool[np.ndarray, "
     return base._replace(weight=numbers[:-1], bias=float(numbers[-1]))
 
 
-def may_rise(p: Float[np.ndarray, " n"], own: Own, pooled: float) -> float:
+def highest_level(p: Float[np.ndarray, " n"], own: Own, pooled: float) -> float:
     """Return how high a calibration half may set the level: the pooled one or a higher.
 
     Args:

@@ -182,13 +182,9 @@ def _rival(look: "Look") -> str:
         away = np.hypot(*(pose[number, :2] - pose[0, :2]))
         told.append(f"{number + 1}: cost {cost[number]:.3f}, {away:.0f} m away")
     gap = cost[1:].min() - cost[0]
-    judged = (
-        "cheaper than the answer"
-        if gap < 0
-        else "ambiguous"
-        if gap < AMBIGUOUS
-        else "clearly worse"
-    )
+    judged = "ambiguous" if gap < AMBIGUOUS else "clearly worse"
+    if gap < 0:
+        judged = "cheaper than the answer"
     return f"{'; '.join(told)}: {judged}"
 
 

@@ -32,7 +32,10 @@ UNIT_OF = {10: "s", 13: "ms", 16: "us", 19: "ns"}
 """Unit of a UNIX time of so many digits, from 2001 to 2286."""
 
 _UNIX = re.compile(
-    r"(?<![\d.])(?:([1-9]\d{9}\.\d+)|([1-9]\d{9})[-_](\d{9})|([1-9](?:\d{9}|\d{12}|\d{15}|\d{18})))(?!\d)"
+    r"(?<![\d.])(?:"
+    r"([1-9]\d{9}\.\d+)|([1-9]\d{9})[-_](\d{9})|([1-9](?:\d{9}|\d{12}|\d{15}|\d{18}))"
+    r")(?!\d)",
+    re.ASCII,
 )
 """Seconds with decimals, seconds and nanoseconds, or one number; a leading zero counts frames."""
 
