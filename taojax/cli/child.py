@@ -112,6 +112,8 @@ class _Interrupted(SystemExit):
 
 
 def _end_silently(*_: object) -> None:
+    # A file that the interrupt leaves half made would complain when it is collected.
+    sys.unraisablehook = lambda _: None
     raise _Interrupted(130)
 
 
