@@ -39,7 +39,7 @@ LEVEL_OVER_SHARE = 2.4
 """Level of the probability over the promised share. The pooled model is unsure of what it has not
 seen: at 1.6 times .05 the shipped numbers accept .70 of the right answers of left-out recordings
 with .035 wrong, at 2.4 times .05 .73 with .035; at 3.0 times causal ones break the promise (.064).
-Refined final ones could go to 4.0 times: .77 with .018, where 2.4 gives .75 with .017."""
+A half that checks itself may go higher, see `highest_level` of the judge."""
 
 HALF_TRUSTED = 0.12
 """Probability of being wrong at which an answer counts half as a witness for those after it."""
